@@ -52,11 +52,28 @@ def test_images_in_the_folder_that_reconstruct_writes(files: Path, capsys: pytes
     assert "photographs are not shown: none in" in capsys.readouterr().out
 
 
+def test_what_reconstruct_writes_is_found_by_itself(files: Path, capsys: pytest.CaptureFixture) -> None:
+    for index in range(2):
+        (files / f"{index}.png").unlink()
+    write = {"images": np.full((3, 400, 560, 3), 100, np.uint8)}
+    np.savez(files / "views.npz", **write)
+    run(files / "scene.ply", "--html", files / "page.html")
+    assert f"3 of 3 cameras have their image in {files / 'views.npz'}" in capsys.readouterr().out
+    assert (files / "page.html").read_text().count('"picture": "') == 3
+    np.savez(files / "views.npz", images=write["images"][:2])
+    run(files / "scene.ply", "--html", files / "page.html")
+    assert "photographs are not shown: none in" in capsys.readouterr().out
+    (files / "views.npz").write_bytes(b"nonsense")
+    with pytest.raises(SystemExit, match=r"cannot read .*views\.npz"):
+        run(files / "scene.ply", "--html", files / "page.html")
+
+
 def test_mistakes_end_with_one_line(files: Path, capsys: pytest.CaptureFixture) -> None:
     write_gaussian_ply(files / "empty.ply", scene(0))
     (files / "broken.ply").write_bytes(b"ply\nnonsense")
     (files / "0.png").write_bytes(b"nonsense")
     html, ply = ("--html", files / "page.html"), files / "scene.ply"
+    elsewhere = files / "alone" / "scene.ply"
     cases: list[tuple[tuple[Path | str, ...], str]] = [
         ((files / "absent.ply", *html), "absent.ply"),
         ((files / "cameras.json", *html), "expected a scene of Gaussians, .ply"),
@@ -64,7 +81,7 @@ def test_mistakes_end_with_one_line(files: Path, capsys: pytest.CaptureFixture) 
         ((files / "empty.ply", *html), "empty.ply holds no Gaussians"),
         ((ply, *html, "--port", "9000"), "omit --host, --port and --share"),
         ((ply, *html, "--share"), "omit --host, --port and --share"),
-        ((ply, *html, "--images", files), "--images requires --cameras"),
+        ((elsewhere, *html, "--images", files), "--images requires --cameras"),
         ((ply, *html, "--cameras", ply), "scene.ply: not valid JSON"),
         ((ply, *html, "--cameras", files / "cameras.json"), "0.png"),
         ((ply, "--port", "70000"), "--port"),

@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from vg2gt.types import Gaussians
     from vg2gt.viewer import ViewerScene
 
-IMAGE_FOLDER = "images"  # next to cameras.json, as `vg2gt reconstruct --save images` writes it
+# next to scene.ply, as `vg2gt reconstruct` writes them
+CAMERAS, VIEWS, IMAGE_FOLDER = "cameras.json", "views.npz", "images"
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -31,6 +32,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     arguments = parser.parse_args(argv)
     if arguments.html is not None and (arguments.host, arguments.port, arguments.share) != (None, None, False):
         parser.error("--html writes a file and starts no server; omit --host, --port and --share")
+    known = arguments.scene.parent / CAMERAS
+    if arguments.cameras is None and known.is_file():
+        arguments.cameras = known
     if arguments.images is not None and arguments.cameras is None:
         parser.error("--images requires --cameras, which lists the image names")
     with errors_in_one_line():
@@ -52,8 +56,12 @@ def _parser() -> argparse.ArgumentParser:
     parser = flag_parser("view", COMMANDS["view"])
     add = parser.add_argument
     add("scene", type=Path, help="scene.ply, .spz, .splat or .glb")
-    add("--cameras", type=Path, help="cameras.json of the scene; the first one is the initial view")
-    add("--images", type=Path, help="folder of the cameras' images; default: that of cameras.json, or images/ in it")
+    add("--cameras", type=Path, help="cameras, the first is the initial view; default: cameras.json next to the scene")
+    add(
+        "--images",
+        type=Path,
+        help="folder of the cameras' images; default: that of cameras.json, or images/ or views.npz in it",
+    )
     add("--color", choices=("trust",), help="trust: colour by stated error and status of a scene.ply written by vg2gt")
     add("--html", type=Path, help="write one self-contained page to this file instead of serving")
     add("--title", help="title of the page; default: the scene's file name")
@@ -84,8 +92,8 @@ def _scene(arguments: argparse.Namespace) -> ViewerScene:
         return ViewerScene(gaussians, title=title)
     cameras = read_cameras_json(arguments.cameras)
     near = arguments.cameras.parent
-    folders = [arguments.images] if arguments.images is not None else [near, near / IMAGE_FOLDER]
-    return ViewerScene(gaussians, cameras, _pictures(cameras, folders), title)
+    sources = [arguments.images] if arguments.images is not None else [near, near / IMAGE_FOLDER, near / VIEWS]
+    return ViewerScene(gaussians, cameras, _pictures(cameras, sources), title)
 
 
 def _by_trust(path: Path, gaussians: Gaussians) -> Gaussians:
@@ -104,18 +112,18 @@ def _by_trust(path: Path, gaussians: Gaussians) -> Gaussians:
     return replace(gaussians, sh=rgb_to_sh(colors.T)[:, None])
 
 
-def _pictures(cameras: Sequence[NamedCamera], folders: Sequence[Path]) -> list[NDArray[np.uint8] | None]:
-    """Loads the cameras' images from the first folder that has any, and prints which."""
-    from vg2gt.viewer import load_pictures
+def _pictures(cameras: Sequence[NamedCamera], sources: Sequence[Path]) -> list[NDArray[np.uint8] | None]:
+    """Loads the cameras' images from the first folder or views.npz that has any, and prints which."""
+    from vg2gt.viewer.content import load_pictures, load_view_pictures
 
-    for folder in folders:
-        pictures = load_pictures(cameras, folder)
+    for source in sources:
+        pictures = (load_view_pictures if source.name == VIEWS else load_pictures)(cameras, source)
         found = sum(picture is not None for picture in pictures)
         if found:
-            print(f"{found} of {len(cameras)} cameras have their image in {folder}")
+            print(f"{found} of {len(cameras)} cameras have their image in {source}")
             return pictures
-    looked = " or ".join(str(folder) for folder in folders)
-    print(f"photographs are not shown: none in {looked} (reconstruct with --save images, or --images DIR)")
+    looked = " or ".join(str(source) for source in sources)
+    print(f"photographs are not shown: none in {looked} (reconstruct with --save views.npz, or --images DIR)")
     return []
 
 

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import ImageOps
+from PIL import Image, ImageOps
 
+from vg2gt.io.arrays import read_npz
 from vg2gt.io.cameras_json import NamedCamera, invert_pose
 from vg2gt.io.glb import scene_extent
 from vg2gt.io.images import color_image, open_image
@@ -106,6 +107,27 @@ def load_pictures(cameras: Sequence[NamedCamera], folder: str | Path) -> list[ND
         inside = path is not None and path.is_relative_to(root) and path.is_file()
         pictures.append(_small_picture(path) if path is not None and inside else None)
     return pictures
+
+
+def load_view_pictures(cameras: Sequence[NamedCamera], path: Path) -> list[NDArray[np.uint8] | None]:
+    """Loads thumbnails of the cameras' images from a ``views.npz`` of the same scene.
+
+    Returns:
+        One per camera; empty if there is no such file or it has another number of views.
+
+    Raises:
+        ValueError: if the file cannot be read; the message names it.
+    """
+    if not path.is_file():
+        return []
+    try:
+        images = read_npz(path, ["images"])["images"]
+        pictures = [Image.fromarray(image) for image in images]
+    except Exception as error:  # damaged archives and arrays that are no images
+        raise ValueError(f"cannot read {path}: {error}; restore or remove it") from error
+    for picture in pictures:
+        picture.thumbnail((PICTURE_SIDE, PICTURE_SIDE))
+    return [np.array(picture) for picture in pictures] if len(pictures) == len(cameras) else []
 
 
 def _small_picture(path: Path) -> NDArray[np.uint8]:
