@@ -45,9 +45,9 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int | None:
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
-    """Folder of real samples and reference outputs that stands beside a developer's checkout; skips without it."""
+    """Folder of real samples and reference outputs next to the checkout; skips without it."""
     if not SHARED.is_dir():
-        pytest.skip(f"needs the reference data folder {SHARED.name}/ beside the checkout")
+        pytest.skip(f"needs the reference data folder {SHARED.name}/ next to the checkout")
     return SHARED
 
 

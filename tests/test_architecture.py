@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tests.commands import ROOT
 
-# What a room of vg2gt may import beside itself and the leaves, which import no other room.
+# What a package of vg2gt may import in addition to itself and the leaves, which import no other package.
 LEAVES = {"types", "config", "memory", "profiling"}
 BASICS = {"geometry", "io", "kernels"}
 MAY_IMPORT: dict[str, set[str]] = {

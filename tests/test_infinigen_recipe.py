@@ -131,7 +131,7 @@ def test_the_check_finds_wrong_depth_and_wrong_poses(recipe, tmp_path):
 
 
 FAKE = """#!/bin/sh
-# Stands in for Infinigen's interpreter: its first argument is the script.
+# Replaces Infinigen's interpreter: its first argument is the script.
 echo "$@" >> {calls}
 case "$1" in
   -c) echo /packages;;

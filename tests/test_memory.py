@@ -124,7 +124,7 @@ def test_full_memory_is_one_error(error):
     with pytest.raises(OutOfMemory, match=said) as caught:
         fail()
     assert caught.value.__cause__ is error
-    note_sizes({"voxels": 1})  # outside: nobody listens
+    note_sizes({"voxels": 1})  # outside: no listener
 
 
 @pytest.mark.parametrize("stage", ["model.fine.point_mlp", "renderer"])

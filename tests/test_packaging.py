@@ -19,7 +19,7 @@ from vg2gt.training.loop import build
 
 @pytest.mark.parametrize("renderer", ["torch", pytest.param("auto", marks=pytest.mark.slow)])
 def test_installed_wheel_trains_from_an_empty_folder(tmp_path: Path, cache: Path, renderer: str) -> None:
-    """With kernels in the slow case: they are compiled anew where the package lies elsewhere."""
+    """With kernels in the slow case: they are compiled again for a package in another folder."""
     making = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(tmp_path / "dist"), str(ROOT)]
     subprocess.run(making, check=True, capture_output=True)
     (wheel,) = (tmp_path / "dist").glob("*.whl")

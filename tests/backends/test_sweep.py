@@ -92,7 +92,7 @@ def test_sources_overlap_and_have_parallax() -> None:
     assert all(view not in sources[view] for view in range(5))
     assert 4 not in sources[:4]
     still = poses.clone()
-    still[1, 0, 3] = 0  # where view 0 stands: no parallax with it
+    still[1, 0, 3] = 0  # at the position of view 0: no parallax with it
     assert choose_sources(still, intrinsics, size, depth_range, 1)[0, 0] != 1
 
 

@@ -1,4 +1,4 @@
-"""examples/write_recordings.py: what comes back, and how an interrupted run goes on."""
+"""examples/write_recordings.py: what is read back, and how an interrupted run resumes."""
 
 import sys
 from pathlib import Path

@@ -60,7 +60,7 @@ def test_cameras_are_outside_of_everything_and_inside_the_world(kind):
 )
 def test_streets_and_landmarks_have_a_far_background_and_a_sky_without_depth(kind, last, nearest, sky, far, farthest):
     depth = np.array([[frame.depth for frame in kind(seed, 8, SIZE).render([0, last], 1)] for seed in range(12)])
-    assert depth[depth > 0].min() > nearest  # nothing stands on the camera's line
+    assert depth[depth > 0].min() > nearest  # nothing is on the camera's path
     assert sky[0] < (depth == 0).mean() < sky[1]
     assert np.median(depth.max((2, 3))) > far
     assert depth.max() < farthest

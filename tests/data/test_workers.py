@@ -1,4 +1,4 @@
-"""How many processes load data where nobody says it."""
+"""The default number of loader processes."""
 
 import os
 from functools import partial

@@ -32,7 +32,7 @@ def add_one(x):
 
 @pytest.fixture
 def room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A package with a kernel, whose constant stands in another file."""
+    """A package with a kernel, whose constant is in another file."""
     folder = tmp_path / "made"
     folder.mkdir()
     (folder / "kernels.py").write_text(KERNEL)
@@ -44,7 +44,7 @@ def room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def value_with(constant: int, room: Path) -> int:
-    """What the kernel returns in a process that starts after the constant was set: all is imported anew."""
+    """What the kernel returns in a new process, started after the constant was set."""
     (room / "constants.py").write_text(CONSTANTS.format(constant))
     compiled._folder.cache_clear()
     for name in [name for name in sys.modules if name.split(".")[0] == "made"]:
@@ -148,7 +148,7 @@ def test_kernels_take_what_they_need_from_their_own_room() -> None:
 
 
 def test_kernels_made_in_functions_are_found_again_by_other_processes() -> None:
-    """A kernel in a closure has another key in every process, which would compile anew and keep one file more."""
+    """A kernel in a closure has another key in every process, which would compile it again and leave one more file."""
     made = [
         kernel
         for path in sorted((*ROOT.glob("vg2gt/**/*.py"), *ROOT.glob("backends/**/*.py")))

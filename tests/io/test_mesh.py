@@ -33,7 +33,7 @@ def looking_at_origin(views: int, distance: float, size: tuple[int, int]) -> Cam
 
 
 def sphere_depth(cameras: Cameras) -> torch.Tensor:
-    """z-depth of a sphere about the origin, 0 beside it."""
+    """z-depth of a sphere about the origin, 0 elsewhere."""
     rays = ray_directions(cameras.intrinsics, cameras.size)[0]
     origin = cameras.world_to_camera[0, :, None, None, :3, 3]
     a, b = (rays**2).sum(-1), (rays * origin).sum(-1)

@@ -105,7 +105,7 @@ def test_cut_opacities_stay_finite(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("rest", [0, 9, 24, 45])
 def test_other_writers_files(tmp_path: Path, rest: int) -> None:
-    """No normals, another order, doubles, an element before the vertices and properties nobody knows."""
+    """No normals, another order, doubles, an element before the vertices and unknown properties."""
     rng = np.random.default_rng(0)
     names = ["rot_3", "label", *AFTER_REST[:-1], *(f"f_rest_{i}" for i in reversed(range(rest)))]
     names += ["f_dc_2", "f_dc_0", "f_dc_1", "z", "x", "y"]

@@ -76,7 +76,7 @@ for _ in range(40):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere torch's OpenMP has no such entry point")
 def test_no_interruption_is_lost():
-    """It may come as a thread enters the loop's function, from where ctypes reports it and goes on."""
+    """It may be raised as a thread enters the loop's function, where ctypes only reports it."""
     done = subprocess.run(
         [sys.executable, "-c", INTERRUPTED], cwd=ROOT, capture_output=True, text=True, timeout=200, check=False
     )

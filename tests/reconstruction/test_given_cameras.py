@@ -1,4 +1,4 @@
-"""Cameras that lie beside the images, in which order they are taken, and who gets them."""
+"""Camera files next to the images: their order of preference, and which images they belong to."""
 
 import shutil
 from dataclasses import replace

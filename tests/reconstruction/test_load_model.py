@@ -43,7 +43,7 @@ def test_what_is_unknown_is_named(overrides: list[str], said: str) -> None:
 
 
 def test_a_slim_checkpoint_is_the_same_model(run_folder: Path, tmp_path: Path) -> None:
-    """Weights without the optimiser, with all that names them: no run's folder is needed beside them."""
+    """Weights without the optimiser, with their configuration: no run folder is needed."""
     known = torch.load(run_folder / "checkpoints" / "step-7.ckpt", weights_only=True)
     known["config"] = made_of(read_run_config(run_folder / "config.yaml"))
     torch.save(known, tmp_path / "whole.ckpt")

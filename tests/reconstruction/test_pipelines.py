@@ -31,7 +31,7 @@ from vg2gt.types import Gaussians
 
 @pytest.mark.parametrize("put", [put_colmap, put_transforms, put_cameras])
 def test_landscape_and_portrait_mixed_are_read_whole(folder: Path, frames, put, caplog) -> None:
-    """Sizes were read after the images were cut to the median shape, and nobody heard of it."""
+    """Sizes were read after the images were cropped to the median shape, without a warning."""
     put(folder, frames)
     turned = folder / "images" / NAMES[3]
     with Image.open(turned) as image:
@@ -195,7 +195,7 @@ def test_panoramas_are_refused_in_one_line(tmp_path: Path) -> None:
 
 
 def test_images_and_a_photograph_beside_their_folder(folder: Path, caplog) -> None:
-    """The one beside images/ was taken alone; folders were passed over without a word."""
+    """Only the one next to images/ was used; folders were skipped without a warning."""
     shutil.copy(folder / "images" / NAMES[0], folder / "preview.png")
     assert len(find_pictures(folder)) == 4
     assert "ignored in the same folder: preview.png" in caplog.text

@@ -1,4 +1,4 @@
-"""What the official code computed, kept beside this file (the README tells what and how). Nothing is unpickled."""
+"""Outputs of the official code, stored next to this file (see the README). Nothing is unpickled."""
 
 import json
 import lzma

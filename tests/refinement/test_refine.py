@@ -125,7 +125,7 @@ def test_what_two_views_support_starts_coarse(start: Start) -> None:
 
 
 def test_merged_gaussians_have_the_moments_of_their_mixture() -> None:
-    """Against weighted moments of points drawn from the mixture; the cell beside is on its own."""
+    """Compared with weighted moments of points drawn from the mixture; the neighbouring cell is separate."""
     generator = torch.Generator().manual_seed(0)
     means = torch.tensor([[0.2, 0.3, 0.4], [0.8, 0.6, 0.5], [1.5, 0.5, 0.5]])
     quats = torch.nn.functional.normalize(torch.randn(3, 4, generator=generator), dim=-1)

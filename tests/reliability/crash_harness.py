@@ -1,4 +1,4 @@
-"""Starts real trainings in process groups of their own, kills them at chosen moments and goes on until they finish."""
+"""Starts trainings in their own process groups, kills them at chosen moments and resumes them until they finish."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def start(module: str, arguments: Sequence[str], folder: Path, warm: bool = True
 
 
 def training(folder: Path, cache: Path, *overrides: str) -> list[str]:
-    """The command line that starts a run and goes on with it."""
+    """The command line that starts and resumes a run."""
     fixed = [f"output_dir={folder}", f"hydra.run.dir={folder}", f"data.cache_dir={cache}", "ckpt=auto"]
     return [*fixed, *RUN, *overrides]
 

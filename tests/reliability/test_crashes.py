@@ -70,7 +70,7 @@ def test_killed_run_equals_uninterrupted(tmp_path: Path, cache: Path, whole: Pat
 
 
 def test_a_damaged_last_checkpoint_is_set_aside(tmp_path: Path, cache: Path, whole: Path) -> None:
-    """The run goes on from the one before, says so, and ends the same."""
+    """The run resumes from the previous one, reports it, and ends with the same weights."""
     folder = tmp_path / "run"
     shutil.copytree(whole, folder)
     newest = folder / "checkpoints" / f"step-{harness.STEPS}.ckpt"

@@ -106,7 +106,7 @@ def spoil(module: nn.Module) -> None:
 
 @pytest.mark.parametrize(("first_seed", "count"), [(0, 30), pytest.param(1000, 400, marks=pytest.mark.slow)])
 def test_mutated_scenes_do_no_harm(first_seed, count, tmp_path, cache, monkeypatch) -> None:
-    """Trains on random mutations in the order of their seeds, half of them in a batch beside a good scene."""
+    """Trains on random mutations in the order of their seeds, half of them batched with a good scene."""
     run, good = make(FULL, tmp_path, cache, monkeypatch)
     batches, labels = [], []
     for seed in range(first_seed, first_seed + count):

@@ -1,4 +1,4 @@
-"""A full disk ends a run with one error that names the file; what was there before stays, and the run goes on."""
+"""A full disk ends a run with one error that names the file; existing files stay, and the run can resume."""
 
 import re
 import resource

@@ -121,7 +121,7 @@ def test_the_step_of_two_scenes_is_the_mean_of_theirs(tmp_path: Path, cache: Pat
     assert min(deviations) < 5e-6, deviations
 
 
-# ------------------------------------------------------------------------------------------------ nobody is waited for
+# ----------------------------------------------------------------------------- a failed process ends the others
 
 
 MODELS = ["model=tiny", "model=pixel_aligned", "model=voxel_merged"]

@@ -132,7 +132,7 @@ NAMES = ["../secret.png", "/etc/passwd", "a/../../secret.png", "images/../../sec
 
 @pytest.fixture
 def secret(tmp_path: Path) -> Path:
-    """A picture beside the scene's folder, which no scene may read."""
+    """An image outside the scene's folder, which no scene may read."""
     path = tmp_path / "secret.png"
     Image.new("RGB", (64, 48), "red").save(path)
     return path

@@ -66,7 +66,7 @@ def test_wherever_it_stands(run_folder: Path, canary: Path, place: str) -> None:
 
 
 def test_the_runs_data_call_nothing_foreign(run_folder: Path, canary: Path, rooms, caplog) -> None:
-    """An evaluation only asks what was trained on: it says why it cannot know, and goes on."""
+    """An evaluation only needs to know the training data: it warns that it cannot, and continues."""
     edit(run_folder, lambda config: config.update(data={"_target_": "os.mkdir", "path": str(canary)}))
     refuse_training_views(run_folder / "checkpoints" / "step-7.ckpt", rooms, [])
     assert "cannot check whether" in caplog.text
@@ -136,7 +136,7 @@ def test_hyper_parameters_of_a_checkpoint_call_nothing(run_folder: Path, canary:
     content |= {"hyper_parameters": {**hostile, "_instantiator": "os.system"}, "hparams_name": "kwargs"}
     content |= {"hparams_type": "os.system", "datamodule_hyper_parameters": hostile}
     torch.save(content | {"callbacks": {"os.system": hostile}}, path)
-    assert load_model(run_folder, device="cpu").weights.step == 7  # what nobody reads does no harm
+    assert load_model(run_folder, device="cpu").weights.step == 7  # unused entries do no harm
 
 
 def test_a_package_is_trusted_by_name(run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, model) -> None:

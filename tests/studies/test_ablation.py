@@ -70,7 +70,7 @@ def test_results_and_tables(finished: Path) -> None:
 
 
 def test_all_continue_from_the_same_full_model(finished: Path) -> None:
-    """The full model goes on as long as every variant does, and only a new last layer starts anew."""
+    """The full model trains as long as every variant, and only a new last layer starts from scratch."""
     home = finished / "seed-0"
     start = read_checkpoint(newest_valid(home / "start" / "checkpoints"))
     assert start["global_step"] == 2

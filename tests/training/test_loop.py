@@ -196,7 +196,7 @@ def test_wo_split_starts_from_a_full_model(full_run: Path, cache: Path, tmp_path
 
 
 class WithoutDepth(SyntheticScenes):
-    """Posed photographs: rooms whose depth nobody knows."""
+    """Posed photographs: rooms without depth."""
 
     has_depth = False
 

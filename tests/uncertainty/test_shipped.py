@@ -1,4 +1,4 @@
-"""The calibration in the package: it belongs to the weights in the package, and holds on rooms that nobody has seen."""
+"""The calibration in the package matches the weights in the package, and holds on unseen rooms."""
 
 import pytest
 import torch

@@ -91,7 +91,7 @@ def test_points_on_faces_fall_by_division_and_cells_too_far_apart_are_refused_by
 
 def test_voxel_size_guard():
     depth = torch.full((2, 1, 4, 4), 2.0)
-    depth[1] = 0  # nothing valid: the configured size stands
+    depth[1] = 0  # nothing valid: the configured size is used
     intrinsics = torch.diag(torch.tensor([50.0, 50, 1])).expand(2, 1, 3, 3)
     cameras = Cameras(torch.eye(4).expand(2, 1, 4, 4), intrinsics, (4, 4))
     geometry = Geometry(depth, torch.ones_like(depth), cameras, torch.ones(2))

@@ -50,7 +50,7 @@ def test_layers_of_several_views_make_one_surface(normal: tuple[float, ...]) -> 
 
 
 def test_a_step_of_the_floor_stays_a_step(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is 1.5 cells high; a plane through all points beside it leans."""
+    """It is 1.5 cells high; a plane fitted to all points next to it is tilted."""
     points = layers(FLOOR, apart=0.0)
     points[:, 2] += 1.5 * (points[:, 0] > 10)
     parts = moments_of(points)
@@ -88,7 +88,7 @@ def test_facing_normals_are_eigenvectors(size: float, values: tuple[float, ...])
 
 @pytest.mark.parametrize("values", [(0.0, 0.0, 0.0), (1e6, 1e6, 1e6), (0.0, 0.0, 1e6), (2e6, 2e6, 3e6)])
 def test_without_a_single_least_direction_the_normal_faces_the_cameras(values: tuple[float, ...]) -> None:
-    """Cells with nothing but the prior, and those beside whose spread the prior is lost."""
+    """Cells with the prior only, and cells whose spread dwarfs the prior."""
     facing = F.normalize(torch.randn(50, 3, generator=torch.Generator().manual_seed(2)), dim=-1)
     spread = torch.diag(torch.tensor(values)).expand(50, 3, 3)
     found = normals.facing_compiled(spread, facing, normals.FACING_PRIOR)

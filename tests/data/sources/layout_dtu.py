@@ -51,7 +51,7 @@ def write_training(root: Path, frames: Frames) -> None:
 
 
 def write_test(root: Path, frames: Frames) -> None:
-    """Scan 65 with JPEG images, and depth beside the scans."""
+    """Scan 65 with JPEG images, and depth next to the scans."""
     folder = root / "scans" / "scan65"
     (folder / "cams").mkdir(parents=True)
     for i, image in enumerate(pixels(frames)):

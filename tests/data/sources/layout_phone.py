@@ -83,7 +83,7 @@ def write_polycam(root: Path, frames: Frames, corrected: bool = True) -> None:
 
 
 def write_stray(root: Path, frames: Frames) -> None:
-    """A video, and depth beside it."""
+    """A video, and depth next to it."""
     folder = root / "71de12f9"
     folder.mkdir(parents=True)
     write_video(folder / "rgb.mp4", list(pixels(frames)), fps=30)

@@ -37,7 +37,7 @@ def write_pose_files(folder: Path, frames: Frames, colour: str = "rgb") -> np.nd
 
 
 def write_seven_scenes(root: Path, frames: Frames) -> None:
-    """One sequence, and the intrinsics beside it."""
+    """One sequence, and the intrinsics next to it."""
     folder = root / "chess" / "seq-01"
     folder.mkdir(parents=True)
     for i, pose in enumerate(camera_to_world(frames)):

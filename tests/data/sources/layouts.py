@@ -1,6 +1,6 @@
 """What every loader's tests share: the scene they lay out on disk, and the comparison after it was read back.
 
-A layout says how a dataset is written and how it is read. Modules ``layout_*.py`` beside this one each hold some in a
+A layout says how a dataset is written and how it is read. Modules ``layout_*.py`` in this folder each hold some in a
 dictionary ``LAYOUTS``; every entry goes through the round trip (``test_round_trip.py``) and through damage
 (``test_damage.py``).
 """

@@ -97,7 +97,7 @@ def test_seeds_of_a_job_are_divided_when_the_job_is_named(tmp_path):
 def test_what_infinigen_itself_wrote_is_read_and_its_depth_is_z_depth():
     """Three frames of both cameras of a rig, 48x27, left by the render task of Infinigen 1.15.5 (a chair and a table
     of its making between three planes). One view's points lie where the other views see them; were its depth the
-    length of rays, they would be off by half a percent and more. Pictures of depth lie beside the arrays."""
+    length of rays, they would be off by half a percent and more. Images of the depth are next to the arrays."""
     source = Infinigen(str(Path(__file__).parents[1] / "reference" / "infinigen"), cameras=[0, 1])
     second = 1_000_000_000
     assert source.frames("room") == (1, 2, 3, second + 1, second + 2, second + 3)

@@ -27,7 +27,7 @@ def _wall(step: float, width: float, height: float, z: float) -> np.ndarray:
 
 
 def test_what_is_behind_a_sparse_surface_is_hidden():
-    """A front wall with a point at every third pixel: what shines through goes, what is beside it stays."""
+    """A front wall with a point at every third pixel: points behind it are removed, points next to it stay."""
     front, back = _wall(0.06, 1.2, 1.0, 2.0), _wall(0.02, 8, 8, 4.0)
     depth = render_points(np.concatenate((back, front)), np.eye(4), K, VIEW)
     rows, columns = slice(20, 60), slice(25, 75)  # well inside the front wall's image
