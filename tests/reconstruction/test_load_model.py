@@ -3,12 +3,13 @@ from pathlib import Path
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 
 import vg2gt
 from vg2gt.config import compose_groups
 from vg2gt.memory import OutOfMemory
 from vg2gt.runs.checkpoints import read_checkpoint, write_checkpoint, write_slim
-from vg2gt.runs.load import SHIPPED, load_model, made_of
+from vg2gt.runs.load import SHIPPED, load_model, made_of, resolve_parts
 from vg2gt.runs.trust import read_run_config
 
 
@@ -92,8 +93,11 @@ def test_the_same_weights_with_other_tokens_are_refused(option: str, said: str, 
     }
     write_checkpoint(checkpoint, tmp_path / "step-1.ckpt")
     assert load_model(tmp_path / "step-1.ckpt", "da3_tiny", ["backend.head_chunk=2"], device="cpu").weights.step == 1
-    with pytest.raises(ValueError, match=said):
-        load_model(tmp_path / "step-1.ckpt", "da3_tiny", [f"backend.{option}"], device="cpu")
+    for backend in ("da3_tiny", None):  # named again, or the run's own
+        with pytest.raises(ValueError, match=said):
+            load_model(tmp_path / "step-1.ckpt", backend, [f"backend.{option}"], device="cpu")
+    with pytest.raises(ValueError, match=said):  # as the evaluation does
+        resolve_parts(OmegaConf.from_dotlist([f"backend.{option}"]), tmp_path / "step-1.ckpt")
 
 
 def test_weights_of_a_diverged_training_are_refused(run_folder: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shlex
 import shutil
 import signal
@@ -138,10 +139,36 @@ REFUSED: list[tuple[list[str], str | None]] = [
         ["ckpt=last", "optimizer=adamw", "trainer.max_steps=6"],
         r"trained with vg2gt\.training\.muon\.MuonAdamW and cannot resume with torch\.optim\.AdamW",
     ),
+    (["ckpt=last", "optimizer.lr=0.001"], r"optimizer\.lr=0\.001 differs from 0\.004.*optimiser's state.*init_from="),
+    (["ckpt=last", "optimizer.momentum=0.5"], r"optimizer\.momentum=0\.5 differs from 0\.8"),
+    (["ckpt=last", "training.part=coarse"], r"training\.part=coarse differs from all"),
+    (["ckpt=last", "training.coarse_lr_factor=1"], r"training\.coarse_lr_factor=1 differs from 0\.4"),
     (["ckpt=auto", "trainer.max_steps=3"], r"step-4\.ckpt is at step 4, beyond trainer\.max_steps=3; nothing"),
     (["overwrite=true", "data.train_scenes=0"], r"data\.train_scenes=0 must be at least 1"),
     (["overwrite=true", "data.workers=-1"], r"data\.workers=-1 must be at least 0"),
     (["overwrite=true", "optimizer.lr=-1"], r"optimizer: Invalid learning rate: -1"),
+    *(
+        (["overwrite=true", override], re.escape(override) + ".*" + remedy)
+        for override, remedy in {
+            "loss.geometry=null": r"loss\.geometry\.depth=0",
+            "loss.enhance=null": r"loss\.enhance\.weight=0",
+            "loss.gaussian=null": r"loss\.gaussian\.weight=0",
+            "loss.align=null": "enhanced, rendered or initial",
+            "loss.geometry.quantile=0": "greater than 0 and at most 1",
+            "loss.geometry.quantile=1.5": "greater than 0 and at most 1",
+            "training.render_views=0": "at least 1, or null for all",
+            "training.warmup_steps=-1": "0 for no warm-up",
+            "training.final_lr=0": "a positive number",
+            "optimizer.lr=0": "a positive number",
+            "trainer.gradient_clip_val=-1": "null for no clipping",
+            "trainer.max_steps=-1": "set one of them",
+            "trainer.val_check_interval=0": "a positive number of steps",
+            "data.eval_scenes=0": "at least 1, or null for all",
+            "data.eval_scenes=-1": "at least 1, or null for all",
+            "data.memory_mb=-1": "at least 0",
+        }.items()
+    ),
+    (["overwrite=true", "init_from=."], r"init_from=\. holds no valid checkpoint"),
     (["overwrite=true", "init_from=nowhere.ckpt"], "no checkpoint at nowhere"),
     (["overwrite=true", "+trainer.accumulate_grad_batches=2"], "accumulate"),
     (["overwrite=true", "+trainer.gradient_clip_algorithm=value"], "use norm"),

@@ -98,6 +98,10 @@ class SceneDataModule(LightningDataModule):
         super().__init__()
         if train_scenes is not None and train_scenes < 1:
             raise ValueError(f"data.train_scenes={train_scenes} must be at least 1, or null for all")
+        if eval_scenes is not None and eval_scenes < 0:
+            raise ValueError(f"data.eval_scenes={eval_scenes} must be at least 1, or null for all")
+        if not memory_mb >= 0:
+            raise ValueError(f"data.memory_mb={memory_mb} must be at least 0 (0: no cache of decoded frames)")
         if workers is not None and workers < 0:
             raise ValueError(
                 f"data.workers={workers} must be at least 0 (0: decode in the training process; null: choose by cores "
@@ -129,6 +133,8 @@ class SceneDataModule(LightningDataModule):
         """
         if self._train is not None and self._val is not None:
             return
+        if self.eval_scenes == 0:
+            raise DataError("data.eval_scenes=0 leaves no scene to evaluate: it must be at least 1, or null for all")
         train, val = self.train_source(), self.val_source()
         trainable = train.has_cameras
         if stage == "fit":

@@ -16,12 +16,12 @@ from vg2gt.data.overlap import refuse_overlap
 from vg2gt.data.views import SceneSample
 from vg2gt.model import Reconstructor
 from vg2gt.runs.checkpoints import checkpoint_path, run_config_path
+from vg2gt.runs.load import RESUMED_IN_PLACE, earlier_configs
 from vg2gt.runs.trust import check_targets, read_run_config
 
 log = logging.getLogger(__name__)
 
 UNCHECKED = "cannot check whether the evaluated scenes were used for training: %s"
-RESUMED_IN_PLACE = (None, "last", "auto")
 
 
 def refuse_training_views(checkpoint: Path | None, source: SceneSource, views: Sequence[SceneSample]) -> None:
@@ -47,23 +47,29 @@ def refuse_training_views(checkpoint: Path | None, source: SceneSource, views: S
 
 
 def _ancestry(checkpoint: Path | None) -> Iterator[tuple[Path, DictConfig]]:
-    """Yields the configurations of a checkpoint's run and of the runs that it was initialised from, newest first."""
-    seen = set()
-    while checkpoint is not None and (path := run_config_path(checkpoint)) not in seen:
+    """Yields the configurations of a checkpoint's run and of the runs that it was initialised from, newest first.
+
+    A run that was resumed with other data has several.
+    """
+    seen: set[Path] = set()
+    waiting = [checkpoint]
+    while waiting:
+        checkpoint = waiting.pop(0)
+        if checkpoint is None or (path := run_config_path(checkpoint)) in seen:
+            continue
         seen.add(path)
-        try:
-            run = read_run_config(path)
-        except (OSError, ValueError) as error:
-            log.warning(UNCHECKED, error)
-            return
-        yield path, run
-        given = (run.get("init_from"), run.get("ckpt"))
-        before = next((str(weights) for weights in given if weights not in RESUMED_IN_PLACE), None)
-        try:
-            checkpoint = checkpoint_path(before)
-        except FileNotFoundError:
-            log.warning(UNCHECKED, f"{path}: the run started from {before}, which is not there")
-            return
+        for each in (path, *earlier_configs(path)):
+            try:
+                run = read_run_config(each)
+            except (OSError, ValueError) as error:
+                log.warning(UNCHECKED, error)
+                continue
+            yield each, run
+            for before in (run.get("init_from"), run.get("ckpt")):
+                try:
+                    waiting += [] if before in RESUMED_IN_PLACE else [checkpoint_path(str(before))]
+                except FileNotFoundError:
+                    log.warning(UNCHECKED, f"{each}: the run started from {before}, which is not there")
 
 
 def refuse_without_hints(model: Reconstructor, source: SceneSource) -> None:

@@ -51,7 +51,10 @@ class GeometryLoss:
         point: weight of the point-map task.
         gamma: weight of the confidence-weighted error.
         alpha: weight of the log-confidence.
-        quantile: share of pixels kept; all of them if there are at most 1000.
+        quantile: share of pixels kept, > 0 and <= 1; all of them if there are at most 1000.
+
+    Raises:
+        ValueError: if ``quantile`` is out of range.
     """
 
     depth: float = 1.0
@@ -59,6 +62,12 @@ class GeometryLoss:
     gamma: float = 1.0
     alpha: float = 0.2
     quantile: float = 0.98
+
+    def __post_init__(self) -> None:
+        if not 0 < self.quantile <= 1:
+            raise ValueError(
+                f"loss.geometry.quantile={self.quantile} must be greater than 0 and at most 1; 1 keeps all pixels"
+            )
 
     def __call__(
         self, depth: Tensor, depth_conf: Tensor, cameras: Cameras, truth: Truth, valid: Tensor

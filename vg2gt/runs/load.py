@@ -40,6 +40,9 @@ FREE = ("path", "pretrained", "revision", "head_chunk", "views_per_chunk")
 TOKENS = ("taps", "reference_view", "given_poses")
 """Backend keys that change its outputs for the same weights; a trained part is valid for one choice only."""
 
+RESUMED_IN_PLACE = (None, "last", "auto")
+"""Values of ``ckpt`` and ``init_from`` that name no other run."""
+
 
 @dataclass(frozen=True)
 class TrainedWeights:
@@ -129,6 +132,8 @@ def model_parts(ckpt: str | Path | None, overrides: Sequence[str]) -> tuple[Path
     for override in overrides:
         if override not in chosen:
             parts = _changed(parts, override)
+    if checkpoint is not None and "backend" not in named and of_backend:
+        refuse_other_tokens(parts["backend"], read_checkpoint(checkpoint), checkpoint)
     return checkpoint, parts
 
 
@@ -167,13 +172,13 @@ def resolve_parts(config: DictConfig, checkpoint: Path | None) -> dict[str, Dict
     """
     given: dict[str, Any] = {part: config.get(part) for part in PARTS}
     parts = {part: value for part, value in given.items() if value is not None and "_target_" in value}
-    if checkpoint is not None and "backend" in parts:
-        refuse_other_tokens(parts["backend"], read_checkpoint(checkpoint), checkpoint)
     missing = [part for part in PARTS if part not in parts]
-    if not missing:
-        return parts
-    run = compose("train", "output_dir=.") if checkpoint is None else _config_of(checkpoint, missing)
-    return parts | {part: OmegaConf.merge(run[part], given[part] or {}) for part in missing}  # pyright: ignore
+    if missing:
+        run = compose("train", "output_dir=.") if checkpoint is None else _config_of(checkpoint, missing)
+        parts |= {part: OmegaConf.merge(run[part], given[part] or {}) for part in missing}
+    if checkpoint is not None and given["backend"] is not None:
+        refuse_other_tokens(parts["backend"], read_checkpoint(checkpoint), checkpoint)
+    return parts
 
 
 def refuse_other_tokens(backend: Any, checkpoint: Mapping[str, Any], path: Path) -> None:
@@ -194,6 +199,12 @@ def refuse_other_tokens(backend: Any, checkpoint: Mapping[str, Any], path: Path)
                 f"{path} was trained with backend.{key}={there[key]}, but this run uses {here[key]}: use the same "
                 "value, or start a new run from these weights with init_from="
             )
+
+
+def earlier_configs(path: Path) -> list[Path]:
+    """Returns the ``config-N.yaml`` that a run kept next to its ``config.yaml`` when it was resumed, newest first."""
+    found = {each.stem.removeprefix("config-"): each for each in path.parent.glob("config-*.yaml")}
+    return [found[number] for number in sorted(filter(str.isdecimal, found), key=int, reverse=True)]
 
 
 def made_of(config: DictConfig) -> str:

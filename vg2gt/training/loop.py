@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import logging
+import math
 import os
 import warnings
 from collections.abc import Callable
@@ -53,6 +54,12 @@ FEW_WORKERS = r"The '\w+_dataloader' does not have many workers"  # expected on 
 ALLOCATOR = (f"PYTORCH_{'' if torch.__version__ >= '2.9' else 'CUDA_'}ALLOC_CONF", "expandable_segments:True")
 
 LOGGER_PACKAGES = {"TensorBoardLogger": "tensorboard", "WandbLogger": "wandb"}
+LOSS_WITHOUT = {
+    "geometry": "loss.geometry.depth=0 loss.geometry.point=0",
+    "enhance": "loss.enhance.weight=0",
+    "gaussian": "loss.gaussian.weight=0",
+    "align": "loss.align.source=enhanced, rendered or initial",
+}  # what to write instead of loss.SECTION=null
 PRECISIONS = ("auto", "32-true", "bf16-mixed", "32", "bf16")  # the last two are Lightning's short names
 
 
@@ -79,6 +86,7 @@ def build(config: DictConfig) -> Run:
     """Instantiates the module, data and trainer of a configuration; each constructor is the schema of its section."""
     _check_trainer(config)
     _check_loggers(config)
+    _check_loss(config)
     lightning.seed_everything(config.seed, workers=True, verbose=False)
     accelerator = _accelerator(config.trainer.accelerator)
     if accelerator == "gpu":
@@ -124,9 +132,11 @@ def _optimizer(config: DictConfig) -> Callable[..., torch.optim.Optimizer]:
     """Instantiates the optimiser's partial and tries it, as Lightning would only call it after the first evaluation."""
     make = instantiate(config)
     try:
-        make([torch.nn.Parameter(torch.zeros(1))])
+        rate = make([torch.nn.Parameter(torch.zeros(1))]).param_groups[0]["lr"]
     except ValueError as error:
         raise ValueError(f"optimizer: {error}") from error
+    if not 0 < rate < math.inf:
+        raise ValueError(f"optimizer.lr={rate} must be a positive number; vg2gt evaluate works without training")
     return make
 
 
@@ -157,6 +167,29 @@ def _check_trainer(config: DictConfig) -> None:
         )
     if (clipping := config.trainer.get("gradient_clip_algorithm")) not in (None, "norm"):
         raise ValueError(f"trainer.gradient_clip_algorithm={clipping} is not supported; use norm")
+    if (norm := config.trainer.get("gradient_clip_val")) is not None and not norm >= 0:
+        raise ValueError(f"trainer.gradient_clip_val={norm} must be at least 0; null for no clipping")
+    every = config.trainer.get("val_check_interval")
+    if isinstance(every, (int, float)) and not every > 0:
+        raise ValueError(
+            f"trainer.val_check_interval={every} must be a positive number of steps; a large one, such as 1000000000, "
+            "for no evaluation during training"
+        )
+    steps, epochs = config.trainer.get("max_steps", -1), config.trainer.get("max_epochs")
+    if steps in (None, -1) and epochs in (None, -1) and not config.trainer.get("fast_dev_run"):
+        raise ValueError(
+            f"trainer.max_steps={steps} without trainer.max_epochs would never end, and the learning rate needs the "
+            "number of steps: set one of them"
+        )
+
+
+def _check_loss(config: DictConfig) -> None:
+    """Raises ValueError for a null section of the loss, which would mean the defaults of its class."""
+    if not str(config.loss.get("_target_")).endswith(".VG2GTLoss"):
+        return
+    for section, remedy in LOSS_WITHOUT.items():
+        if section in config.loss and config.loss[section] is None:
+            raise ValueError(f"loss.{section}=null does not turn anything off: use {remedy}")
 
 
 @memory_advice(TRAINING)

@@ -42,8 +42,8 @@ class VG2GTModule(lightning.LightningModule):
         loss: training objective.
         renderer: renders the training and evaluation views.
         optimizer: builds the optimiser from parameter groups (Hydra partial); its ``lr`` is the initial learning rate.
-        final_lr: learning rate at the end of the cosine schedule.
-        warmup_steps: steps of linear warm-up.
+        final_lr: learning rate at the end of the cosine schedule; > 0.
+        warmup_steps: steps of linear warm-up; 0 for none.
         coarse_lr_factor: multiplies the learning rate of the coarse module; > 0.
         backend_lr_factor: multiplies the learning rate of the backbone, if it is trained; > 0.
         part: what to train: ``all``, or only the ``coarse`` module, with the geometry and enhancement losses and
@@ -84,6 +84,7 @@ class VG2GTModule(lightning.LightningModule):
                 raise ValueError(
                     f"training.{name}_lr_factor={factor} must be a positive number; 1 is the optimiser's rate"
                 )
+        _check_steps(final_lr, warmup_steps, render_views)
         self.model = model
         self.part = part
         if part == "coarse":
@@ -294,6 +295,19 @@ def _leave_only_coarse(model: Reconstructor) -> None:
         )
     for name, parameter in model.named_parameters():
         parameter.requires_grad_(parameter.requires_grad and name.startswith("coarse."))
+
+
+def _check_steps(final_lr: float, warmup_steps: int, render_views: int | None) -> None:
+    """Raises ValueError for an invalid schedule or number of rendered views."""
+    if not 0 < final_lr < math.inf:
+        raise ValueError(f"training.final_lr={final_lr} must be a positive number, such as 1e-8 to end near 0")
+    if type(warmup_steps) is not int or warmup_steps < 0:
+        raise ValueError(f"training.warmup_steps={warmup_steps} must be a whole number of steps; 0 for no warm-up")
+    if render_views is not None and (type(render_views) is not int or render_views < 1):
+        raise ValueError(
+            f"training.render_views={render_views} must be at least 1, or null for all; training.part=coarse or "
+            "loss.gaussian.weight=0 train without rendered views"
+        )
 
 
 def _check_part(part: str, pose_noise: float) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import shutil
 from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -12,18 +13,25 @@ from vg2gt.config import flatten
 from vg2gt.io.files import write_text
 from vg2gt.runs.checkpoints import (
     by_age,
+    checkpoint_path,
     initialize_from,
     model_state,
     newest_valid,
     read_checkpoint,
     refuse_not_finite,
+    run_config_path,
 )
-from vg2gt.runs.load import refuse_other_tokens
+from vg2gt.runs.load import RESUMED_IN_PLACE, earlier_configs, refuse_other_tokens
 from vg2gt.runs.trust import read_run_config
 from vg2gt.training.checkpointing import BEST
 from vg2gt.training.module import VG2GTModule
 
 OPTIMIZER = "optimizer._target_"
+IN_OPTIMIZER = ("training.part", "training.coarse_lr_factor", "training.backend_lr_factor", "backend.freeze")
+"""Keys besides ``optimizer.*`` that a checkpoint's optimiser state determines, so that a resumed run ignores them."""
+HARDWARE = "optimizer.fused"  # set by trainer=gpu; does not change what is computed
+ORIGIN = ("data", "init_from", "ckpt")  # what a run was trained on, which an evaluation reads
+LOADING = ("data.steps_per_epoch", "data.workers", "data.memory_mb")  # do not change which scenes those are
 
 log = logging.getLogger(__name__)
 
@@ -72,6 +80,7 @@ def load_start(module: VG2GTModule, config: DictConfig, checkpoint: Path | None)
     """Loads the initial weights: those of ``checkpoint``, else of ``init_from``, else none. Writes nothing.
 
     Raises:
+        FileNotFoundError: if ``init_from`` names no valid checkpoint or run.
         ValueError: if they are not finite or belong to another model, backbone or optimiser.
     """
     if checkpoint is not None:
@@ -79,14 +88,39 @@ def load_start(module: VG2GTModule, config: DictConfig, checkpoint: Path | None)
         refuse_not_finite(content["state_dict"], checkpoint)
         refuse_other_tokens(config.backend, content, checkpoint)
         module.model.load_trained(model_state(content["state_dict"]), content.get("backend"))
-        name_differences(config)
+        name_differences(config, checkpoint)
     elif config.init_from:
-        initialize_from(module, config.init_from)
+        initialize_from(module, _initial(config.init_from))
+
+
+def _initial(path: str) -> str | Path:
+    """The file of initial weights: ``path``, or the newest checkpoint if it is a run's folder."""
+    if not Path(path).is_dir():
+        return path
+    try:
+        return checkpoint_path(path) or path
+    except FileNotFoundError as error:
+        raise FileNotFoundError(
+            f"init_from={path} holds no valid checkpoint: give a run's folder such as outputs/quickstart, or a "
+            "checkpoint's file"
+        ) from error
 
 
 def prepare_folder(config: DictConfig, checkpoint: Path | None) -> None:
-    """Removes half-written files and an overwritten run, renames damaged checkpoints, writes ``config.yaml``."""
+    """Removes half-written files and an overwritten run, renames damaged checkpoints, writes ``config.yaml``.
+
+    A resumed run keeps its earlier ``config.yaml`` as ``config-1.yaml`` and so on if its training data or initial
+    weights differ, so that an evaluation knows all scenes that it was trained on.
+    """
     folder = Path(config.output_dir)
+    current = folder / "config.yaml"
+    kept = earlier_configs(current)
+    if checkpoint is None or not _in_place(config, checkpoint):
+        for path in kept:  # of a run that was replaced
+            path.unlink()
+    elif current.is_file() and _origin(read_run_config(current)) != _origin(config):
+        number = 1 + (int(kept[0].stem.removeprefix("config-")) if kept else 0)
+        write_text(current.with_name(f"config-{number}.yaml"), current.read_text(encoding="utf-8"))
     for path in [*folder.glob(".*.tmp"), *(folder / "checkpoints").glob("*.tmp")]:
         path.unlink()
     old = by_age(folder / "checkpoints")
@@ -100,12 +134,37 @@ def prepare_folder(config: DictConfig, checkpoint: Path | None) -> None:
         (folder / "checkpoints" / BEST).unlink(missing_ok=True)
         shutil.rmtree(folder / "logs", ignore_errors=True)
         (folder / "metrics.json").unlink(missing_ok=True)
-    write_text(folder / "config.yaml", OmegaConf.to_yaml(config, resolve=True))
+    write_text(current, OmegaConf.to_yaml(config, resolve=True))
 
 
-def name_differences(config: DictConfig) -> None:
-    """Logs how a resumed run's configuration differs from before; raises ValueError if the optimiser does."""
+def _in_place(config: DictConfig, checkpoint: Path) -> bool:
+    """Whether a checkpoint is one of the run's own."""
+    return checkpoint.resolve().parent == (Path(config.output_dir) / "checkpoints").resolve()
+
+
+def _origin(config: DictConfig) -> dict[str, Any]:
+    """What a configuration says about the data that a run's weights come from."""
+    plain = flatten(OmegaConf.to_container(config, resolve=True))
+    return {
+        key: None if key in ("init_from", "ckpt") and value in RESUMED_IN_PLACE else value
+        for key, value in plain.items()
+        if key.partition(".")[0] in ORIGIN and key not in LOADING
+    }
+
+
+def name_differences(config: DictConfig, checkpoint: Path | None = None) -> None:
+    """Logs how a resumed run's configuration differs from that of the checkpoint's run.
+
+    Args:
+        config: configuration of the resumed run.
+        checkpoint: where it resumes; None: a checkpoint in its own folder.
+
+    Raises:
+        ValueError: if the optimiser, or an option that its restored state would override, differs.
+    """
     path = Path(config.output_dir) / "config.yaml"
+    if checkpoint is not None and not _in_place(config, checkpoint):
+        path = run_config_path(checkpoint)
     if not path.is_file():
         return
     before, now = (flatten(OmegaConf.to_container(c, resolve=True)) for c in (read_run_config(path), config))
@@ -115,6 +174,14 @@ def name_differences(config: DictConfig) -> None:
             "from its weights with name= and init_from="
         )
     different = sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))
+    for key in different:
+        of_optimizer = OPTIMIZER in before and key.startswith("optimizer.") and key != HARDWARE
+        if of_optimizer or (key in IN_OPTIMIZER and key in before and key in now):
+            raise ValueError(
+                f"{key}={now.get(key, 'not set')} differs from {before.get(key, 'not set')}, with which the run was "
+                "trained: a resumed run continues with its optimiser's state, which includes it. Keep the old value, "
+                "or start a new run from its weights with name= and init_from="
+            )
     different = [key for key in different if key not in ("ckpt", "output_dir", "overwrite")]
     if different:
         log.warning("the resumed run differs from the interrupted one in %s", ", ".join(different))
