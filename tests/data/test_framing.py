@@ -125,3 +125,5 @@ def test_padded_batches_hold_whole_frames(rooms):
     assert not batch.depth[..., :, :4].any()
     assert not batch.depth[..., :, -4:].any()
     assert batch.depth[..., 8:20].all()
+    assert not batch.mask[..., :4].any()
+    assert (batch.mask[..., 8:20] == 1).all()

@@ -1,3 +1,4 @@
+import math
 from dataclasses import asdict, replace
 
 import pytest
@@ -8,7 +9,7 @@ from vg2gt.evaluation.evaluator import MODES, PROTOCOLS, SceneEvaluator, SceneRe
 from vg2gt.evaluation.in_training import evaluate_scene
 from vg2gt.evaluation.options import EvaluationOptions, PointOptions
 from vg2gt.evaluation.protocols import ground_truth_target_cameras, joint_target_cameras
-from vg2gt.evaluation.scene_metrics import align_geometry, point_cloud_metrics
+from vg2gt.evaluation.scene_metrics import align_geometry, image_metrics, point_cloud_metrics
 from vg2gt.geometry.alignment import Similarity
 from vg2gt.geometry.cameras import relative_to_first, scale_translations
 from vg2gt.geometry.normals import normals_from_depth
@@ -115,6 +116,16 @@ def test_true_depth_out_of_range_is_unknown_to_every_figure(module_and_batch, re
     similarity = align_geometry(geometry, near.context)
     points = point_cloud_metrics(geometry.depth, geometry.cameras, near.context, similarity, **asdict(PointOptions()))
     assert scores["points/decoded/f_score"] == points["f_score"]
+
+
+def test_masked_pixels_count_as_correct(result: SceneResult, batch: Batch) -> None:
+    render, truth = result.renders["gt_pose"], batch.target
+    mask = torch.ones_like(truth.depth)
+    mask[..., :56] = 0
+    found = image_metrics(render, replace(truth, mask=mask))
+    right = psnr(render.color[0, :, :, :, 56:], truth.images[0, :, :, :, 56:])
+    assert found["psnr"] == pytest.approx(float(right.mean()) + 10 * math.log10(2), abs=1e-3)
+    assert found["ssim"] > image_metrics(render, truth)["ssim"]
 
 
 def test_points_of_unknown_pixels_are_not_wrong(batch: Batch) -> None:

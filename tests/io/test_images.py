@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 
 from vg2gt.io.errors import DataError
-from vg2gt.io.image_files import image_size, read_color
+from vg2gt.io.image_files import image_size, read_color, read_mask, read_mask_file
 from vg2gt.io.images import colorize_depth, grid, write_png
 
 
@@ -51,6 +51,27 @@ def test_photographs_are_turned_upright(tmp_path: Path, orientation: int) -> Non
     Image.fromarray(np.ascontiguousarray(STORED[orientation](upright))).save(tmp_path / "a.png", exif=exif)
     assert image_size(tmp_path / "a.png", "room", upright=True) == (20, 30)
     assert np.array_equal(read_color(tmp_path / "a.png", "room", (20, 30), upright=True), upright)
+
+
+def test_grey_photographs_are_no_masks_and_masks_may_hold_zero_and_one(tmp_path: Path) -> None:
+    half = (np.arange(30) < 15) * np.ones((20, 1), np.uint8)
+    for name, pixels in {"8 bits": half * 255, "16 bits": half.astype(np.uint16) * 65535, "one": half}.items():
+        Image.fromarray(pixels).save(tmp_path / "a.png")
+        assert read_mask(tmp_path / "a.png", "") is None, name
+        assert np.array_equal(read_mask(tmp_path / "a.png", "", is_mask=True), half), name
+
+
+def test_a_mask_of_stored_pixels_is_turned_with_its_photograph(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    upright = np.zeros((30, 20), np.uint8)
+    upright[:10] = 255
+    stored = np.ascontiguousarray(STORED[6](upright))
+    Image.fromarray(stored).save(tmp_path / "photo.png", exif=exif)
+    for mask in (stored, upright):
+        Image.fromarray(mask).save(tmp_path / "mask.png")
+        assert np.array_equal(read_mask_file(tmp_path / "mask.png", "", tmp_path / "photo.png"), upright / 255)
+    assert read_mask_file(tmp_path / "mask.png", "").shape == (30, 20)
 
 
 RAMP = np.linspace(0, 65535, 24 * 32).reshape(24, 32)

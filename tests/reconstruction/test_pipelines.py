@@ -137,6 +137,19 @@ def test_what_is_hidden_is_no_part_of_the_scene(folder: Path, frames, model, kin
     assert torch.equal(again.mask, scene.mask)
 
 
+def test_photographs_without_a_mask_are_named(folder: Path, caplog) -> None:
+    (folder / "masks").mkdir()
+    for name in NAMES[:3]:
+        Image.new("L", (112, 84), 0).save(folder / "masks" / f"{Path(name).stem}.PNG")
+    find_pictures(folder / "images")
+    assert f"1 of 4 images have no mask in {folder / 'masks'}; all their pixels are used: {NAMES[3]}" in caplog.text
+
+
+def test_names_of_several_photographs_give_no_camera(folder: Path, frames) -> None:
+    put_cameras(folder, frames, names=[f"a/{NAMES[0]}", f"b/{NAMES[0]}", *NAMES[2:]])
+    assert [picture.name for picture in given_pictures(folder)] == [Path(name).stem for name in NAMES[2:]]
+
+
 def test_masks_of_photographs_without_cameras(folder: Path) -> None:
     """Also one folder up, and alpha of Pillow images."""
     (folder / "masks").mkdir()

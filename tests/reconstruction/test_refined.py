@@ -47,8 +47,24 @@ def test_a_saved_scene_comes_back(saved: Path, scene: Scene, tmp_path: Path) -> 
     (folder / "views.npz").unlink()
     back = read_scene(folder, scene.renderer)
     assert (back.images - scene.images).abs().max() <= 0.5 / 255 + 1e-6
+    assert back.mask is None
     both = (back.depth > 0) & (scene.depth > 0)
     assert ((back.depth / scene.depth)[both] - 1).abs().median() < 0.02
+
+
+def test_saved_images_are_read_like_photographs(saved: Path, scene: Scene, tmp_path: Path) -> None:
+    """16-bit grey came back white, and hidden pixels as part of the scene."""
+    folder = shutil.copytree(saved, tmp_path / "copy")
+    (folder / "views.npz").unlink()
+    grey, hidden = np.full((84, 112), 0x8000, np.uint16), np.full((84, 112, 4), 200, np.uint8)
+    hidden[:, :56, 3], hidden[:, 56:, 3] = 0, 255
+    Image.fromarray(grey).save(folder / "images" / "008.png")
+    Image.fromarray(hidden).save(folder / "images" / "009.png")
+    back = read_scene(folder, scene.renderer)
+    assert back.images[0].mean() == pytest.approx(0.5, abs=0.01)
+    assert back.mask is not None
+    assert torch.equal(back.mask[1, 0], (torch.arange(112) >= 56).float())
+    assert (back.mask[[0, 2, 3]] == 1).all()
 
 
 def test_in_python(scene: Scene, tmp_path: Path) -> None:
@@ -114,6 +130,7 @@ def test_photographs_are_refined_unless_asked_not_to(scene: Scene) -> None:
         ("scene.ply", "has no scene.ply: give a folder that vg2gt reconstruct has written"),
         ("views.npz", "has no views.npz and no images/008.png"),
         ("shape", r"does not belong to the 4 cameras of 84x112 .*depth \(3, 84, 112\)"),
+        ("other", "views.npz: it is of other images than cameras.json next to it"),
         ("picture", "has 10x10 pixels, its camera 84x112"),
         ("option", "Could not override 'refine.rats.sh'"),
         ("value", "refine.holdout must be at least 2"),
@@ -129,6 +146,9 @@ def test_mistakes_are_one_line(saved, damage, said, tmp_path, monkeypatch):
     elif damage == "shape":
         arrays = dict(np.load(folder / "views.npz"))
         np.savez(folder / "views.npz", **arrays | {"depth": arrays["depth"][:3]})
+    elif damage == "other":
+        arrays = dict(np.load(folder / "views.npz"))
+        np.savez(folder / "views.npz", **arrays | {"names": arrays["names"][::-1]})
     elif damage == "picture":
         (folder / "views.npz").unlink()
         Image.new("RGB", (10, 10)).save(folder / "images" / "008.png")

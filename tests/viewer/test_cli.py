@@ -1,5 +1,6 @@
 """`vg2gt view`: what it writes, and one clear line for everything that is wrong."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -60,12 +61,23 @@ def test_what_reconstruct_writes_is_found_by_itself(files: Path, capsys: pytest.
     run(files / "scene.ply", "--html", files / "page.html")
     assert f"3 of 3 cameras have their image in {files / 'views.npz'}" in capsys.readouterr().out
     assert (files / "page.html").read_text().count('"picture": "') == 3
+    np.savez(files / "views.npz", **write, names=np.array(["0", "1", "3"]))  # left by another run
+    run(files / "scene.ply", "--html", files / "page.html")
+    assert "photographs are not shown: none in" in capsys.readouterr().out
     np.savez(files / "views.npz", images=write["images"][:2])
     run(files / "scene.ply", "--html", files / "page.html")
     assert "photographs are not shown: none in" in capsys.readouterr().out
     (files / "views.npz").write_bytes(b"nonsense")
     with pytest.raises(SystemExit, match=r"cannot read .*views\.npz"):
         run(files / "scene.ply", "--html", files / "page.html")
+
+
+def test_cameras_of_3d_gaussian_splatting(files: Path) -> None:
+    camera = {"id": 0, "img_name": "0", "width": 56, "height": 40, "fx": 50.0, "fy": 50.0}
+    camera |= {"position": [0.0, 0.0, -2.0], "rotation": np.eye(3).tolist()}
+    (files / "cameras.json").write_text(json.dumps([camera]))
+    run(files / "scene.ply", "--html", files / "page.html")
+    assert len(read_viewer_html(files / "page.html")) == 60
 
 
 def test_mistakes_end_with_one_line(files: Path, capsys: pytest.CaptureFixture) -> None:

@@ -32,10 +32,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     arguments = parser.parse_args(argv)
     if arguments.html is not None and (arguments.host, arguments.port, arguments.share) != (None, None, False):
         parser.error("--html writes a file and starts no server; omit --host, --port and --share")
-    known = arguments.scene.parent / CAMERAS
-    if arguments.cameras is None and known.is_file():
-        arguments.cameras = known
-    if arguments.images is not None and arguments.cameras is None:
+    if arguments.images is not None and arguments.cameras is None and not (arguments.scene.parent / CAMERAS).is_file():
         parser.error("--images requires --cameras, which lists the image names")
     with errors_in_one_line():
         if arguments.html is None:
@@ -79,7 +76,8 @@ def _port(text: str) -> int:
 
 
 def _scene(arguments: argparse.Namespace) -> ViewerScene:
-    from vg2gt.io import read_cameras_json, read_gaussians
+    from vg2gt.io import read_gaussians
+    from vg2gt.reconstruction.camera_files import read_cameras
     from vg2gt.viewer import ViewerScene
 
     gaussians = read_gaussians(arguments.scene)
@@ -88,10 +86,10 @@ def _scene(arguments: argparse.Namespace) -> ViewerScene:
     if arguments.color is not None:
         gaussians = _by_trust(arguments.scene, gaussians)
     title = arguments.title or arguments.scene.name
-    if arguments.cameras is None:
+    path = arguments.cameras or arguments.scene.parent / CAMERAS
+    if arguments.cameras is None and not path.is_file():
         return ViewerScene(gaussians, title=title)
-    cameras = read_cameras_json(arguments.cameras)
-    near = arguments.cameras.parent
+    cameras, near = read_cameras(path), path.parent
     sources = [arguments.images] if arguments.images is not None else [near, near / IMAGE_FOLDER, near / VIEWS]
     return ViewerScene(gaussians, cameras, _pictures(cameras, sources), title)
 

@@ -74,16 +74,17 @@ def crop(frames: Frames, top: int, left: int, size: tuple[int, int]) -> Frames:
 def pad(frames: Frames, top: int, left: int, size: tuple[int, int]) -> Frames:
     """Pads frames with black to ``size`` (height, width), their first pixel at (``top``, ``left``).
 
-    The padding has depth 0, and mask 0 if there is a mask.
+    The padding has depth 0 and mask 0.
     """
     height, width = frames.depth.shape[-2:]
+    mask = torch.ones_like(frames.depth) if frames.mask is None else frames.mask
     margins = (left, size[1] - left - width, top, size[0] - top - height)
     return replace(
         frames,
         images=constant_pad(frames.images, margins),
         depth=constant_pad(frames.depth, margins),
         intrinsics=crop_intrinsics(frames.intrinsics, -left, -top),
-        mask=None if frames.mask is None else constant_pad(frames.mask, margins),
+        mask=constant_pad(mask, margins),
     )
 
 

@@ -15,13 +15,16 @@ from vg2gt.types import Batch, Cameras, Geometry, Render
 
 
 def image_metrics(rendered: Render, truth: Batch, lpips: LPIPS | None = None) -> dict[str, float]:
-    """``psnr``, ``ssim`` and, if a network is given, ``lpips`` of one scene, averaged over its views."""
-    found = {
-        "psnr": float(psnr(rendered.color[0], truth.images[0]).mean()),
-        "ssim": float(ssim(rendered.color[0], truth.images[0]).mean()),
-    }
+    """``psnr``, ``ssim`` and, if a network is given, ``lpips`` of one scene, averaged over its views.
+
+    Masked pixels, such as the border of ``data.fit=pad``, count as correct, as in the loss.
+    """
+    images, color = truth.images[0], rendered.color[0]
+    if truth.mask is not None:
+        color = torch.lerp(images, color, truth.mask[0, :, None])
+    found = {"psnr": float(psnr(color, images).mean()), "ssim": float(ssim(color, images).mean())}
     if lpips is not None:
-        found["lpips"] = float(lpips(rendered.color[0], truth.images[0]).mean())
+        found["lpips"] = float(lpips(color, images).mean())
     return found
 
 

@@ -40,6 +40,7 @@ _TURNS = {
     8: Image.Transpose.ROTATE_90,
 }
 _QUARTER_TURNS = (5, 6, 7, 8)
+_SAME_SHAPE = 0.02  # relative difference of aspect ratios of the same shape
 _FILM_DIAGONAL = math.hypot(36, 24)  # millimetres
 
 
@@ -115,29 +116,50 @@ def read_color(
 def read_mask(
     path: Path, scene: str, content: bytes | None = None, upright: bool = False, is_mask: bool = False
 ) -> NDArray[np.float32] | None:
-    """Reads a mask ``[H, W]`` in [0, 1]: an image's alpha, or the brightness of a grey or mask image without alpha.
+    """Reads a mask ``[H, W]`` in [0, 1]: an image's alpha, or the brightness of a mask image without alpha.
 
     Args:
         path: the file.
         scene: the scene it belongs to, for messages; empty: none.
         content: the encoded image if it is a part of the file; None: the whole file.
         upright: turn a photograph upright by its EXIF orientation.
-        is_mask: the file is a mask: use its brightness even if it is stored in colour.
+        is_mask: the file is a mask, so its brightness counts; values 0 and 1 are taken as 0 and 255.
 
     Returns:
-        The mask; None if all pixels count, as in a colour photograph without transparency.
+        The mask; None if all pixels count, as in a photograph without transparency.
     """
     with _opened(path if content is None else io.BytesIO(content), path, scene) as image:
-        grey = image.mode in ("1", "L", "I", "I;16") and "transparency" not in image.info
-        if not grey and not has_alpha(image) and not is_mask:
+        grey = not has_alpha(image)
+        if grey and not is_mask:
             return None
         turn = _TURNS.get(_orientation(image)) if upright else None
-        grey = grey or not has_alpha(image)
         plane = image if image.mode in ("I", "I;16") else image.convert("L") if grey else image
         plane = plane if grey else image.convert("RGBA").getchannel("A")
         values = np.array(plane if turn is None else plane.transpose(turn), np.float32)
-    largest = 255 if values.max(initial=0) <= 255 else 65535
+    highest = values.max(initial=0)
+    largest = 1 if grey and highest == 1 else 255 if highest <= 255 else 65535
     return None if values.min(initial=largest) >= largest else (values / largest).astype(np.float32)
+
+
+def read_mask_file(path: Path, scene: str, photo: Path | None = None) -> NDArray[np.float32] | None:
+    """Reads the mask file of an image (:func:`read_mask`).
+
+    Args:
+        path: the mask.
+        scene: the scene it belongs to, for messages; empty: none.
+        photo: the photograph, if it is turned upright. A mask with the shape of the stored pixels, rather than of the
+            upright photograph, is turned along with it.
+    """
+    mask = read_mask(path, scene, upright=photo is not None, is_mask=True)
+    if mask is None or photo is None:
+        return mask
+    with _opened(photo, photo, scene) as image:
+        turn, (width, height) = _orientation(image), image.size
+    stored = abs(mask.shape[0] * width / (mask.shape[1] * height) - 1) < _SAME_SHAPE
+    upright = abs(mask.shape[0] * height / (mask.shape[1] * width) - 1) < _SAME_SHAPE
+    if turn not in _QUARTER_TURNS or upright or not stored:
+        return mask
+    return np.array(Image.fromarray(mask).transpose(_TURNS[turn]))
 
 
 def orientation(path: Path, scene: str) -> int:

@@ -135,7 +135,7 @@ def _triangles(vertices: NDArray[np.float32], corner: Tensor, outward: Tensor) -
 
 
 def write_mesh(path: str | Path, mesh: Mesh) -> Path:
-    """Writes a mesh with trimesh, atomically, in our world frame; the suffix selects the format.
+    """Writes a mesh with trimesh, atomically, in our world frame, ``.glb`` with y up; the suffix selects the format.
 
     Args:
         path: a file ending in ``.ply``, ``.glb``, ``.obj``, ``.stl`` or ``.off``.
@@ -152,6 +152,8 @@ def write_mesh(path: str | Path, mesh: Mesh) -> Path:
     if not len(mesh.faces):
         raise ValueError("the mesh is empty: no valid depth, or voxels larger than the surfaces; check both")
     body = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.colors, process=False)
+    if path.suffix.lower() == ".glb":
+        body.apply_transform(np.diag([1.0, -1.0, -1.0, 1.0]))  # glTF: y up
     content = body.export(file_type=path.suffix[1:].lower())
     assert not isinstance(content, dict)  # only formats with several files give a dict
     return write_bytes(path, content.encode() if isinstance(content, str) else content)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,6 +21,8 @@ from vg2gt.types import Cameras
 
 if TYPE_CHECKING:
     from vg2gt.reconstruction.scene import Scene
+
+log = logging.getLogger(__name__)
 
 AGREE = 0.05  # maximum relative depth difference at which a view is taken to see a point
 _VIEWS_A_POINT = 12  # maximum number of observations of a point
@@ -86,6 +89,8 @@ def exported_views(scene: Scene, whole: bool) -> ExportedViews:
     poses = torch.from_numpy(np.stack([camera.world_to_camera for camera in named]))
     small = [(camera.height, camera.width) for camera in named]
     photos = [camera.photo for camera in named] if whole else [None] * len(named)
+    if whole and None in photos:
+        log.warning("photographs of a scene read from a folder are not known: images are exported at the working size")
     sizes = tuple((p.height, p.width) if p is not None else s for p, s in zip(photos, small, strict=True))
     matrices = np.stack([c.intrinsics if p is None else p.intrinsics for c, p in zip(named, photos, strict=True)])
     names = [camera.name if photo is None else photo.name for camera, photo in zip(named, photos, strict=True)]

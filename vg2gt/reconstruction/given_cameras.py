@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -214,6 +215,12 @@ def _name_left_out(names: Sequence[str], where: str) -> None:
         log.warning("%s has no cameras for %d images, which are left out: %s", where, len(names), shown)
 
 
+def _unique(named: Sequence[tuple[str, NamedCamera]]) -> dict[str, NamedCamera]:
+    """Returns the cameras by name, without names of several cameras, such as photos of two folders."""
+    counts = Counter(name for name, _ in {(name, id(camera)) for name, camera in named})
+    return {name: camera for name, camera in named if counts[name] == 1}
+
+
 def _from_cameras_json(path: Path, folder: Path) -> list[Picture] | None:
     """Returns pictures of a folder with cameras from ``cameras.json``, matched by file name or stem.
 
@@ -224,9 +231,9 @@ def _from_cameras_json(path: Path, folder: Path) -> list[Picture] | None:
         ValueError: if the file names none of the images.
     """
     named = read_cameras_json(path)
-    cameras = {Path(camera.name).name: camera for camera in named}
-    cameras |= {camera.photo.name: camera for camera in named if camera.photo is not None}
-    by_stem = {Path(name).stem: camera for name, camera in cameras.items()}
+    cameras = _unique([(Path(camera.name).name, camera) for camera in named])
+    cameras |= _unique([(camera.photo.name, camera) for camera in named if camera.photo is not None])
+    by_stem = _unique([(Path(name).stem, camera) for name, camera in cameras.items()])
     files = image_files(folder)
     found = [(file, cameras.get(file.name) or by_stem.get(file.stem) or by_stem.get(file.name)) for file in files]
     known = [(file, camera) for file, camera in found if camera is not None]

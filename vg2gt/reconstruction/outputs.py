@@ -241,12 +241,17 @@ def _images(scene: Scene, target: Path) -> None:
 def _views(scene: Scene, path: Path) -> None:
     """Writes the arrays of the views.
 
-    ``images [V, H, W, 3]`` is uint8; ``depth``, ``depth_conf`` and, if known, ``mask`` and ``error`` are float32
-    ``[V, H, W]``; ``support [V, H, W]``, if known, is uint8.
+    ``names [V]`` are those of the views; ``images [V, H, W, 3]`` is uint8; ``depth``, ``depth_conf`` and, if known,
+    ``mask`` and ``error`` are float32 ``[V, H, W]``; ``support [V, H, W]``, if known, is uint8.
     """
     buffer = io.BytesIO()
     images = np.stack([to_pixels(image) for image in scene.images])
-    arrays = {"images": images, "depth": scene.depth.numpy(), "depth_conf": scene.depth_conf.numpy()}
+    arrays = {
+        "names": np.array(scene.names),
+        "images": images,
+        "depth": scene.depth.numpy(),
+        "depth_conf": scene.depth_conf.numpy(),
+    }
     for name in ("mask", "error", "support"):
         if (values := getattr(scene, name)) is not None:
             arrays[name] = values.numpy()

@@ -24,7 +24,7 @@ from vg2gt.data.sources.masks import joined_masks, mask_of, resized_mask
 from vg2gt.data.sources.parsing import IMAGE_SUFFIXES
 from vg2gt.data.transforms import from_bytes
 from vg2gt.io.files import by_number
-from vg2gt.io.image_files import focal_length, image_size, is_panorama, read_color, read_mask
+from vg2gt.io.image_files import focal_length, image_size, is_panorama, read_color, read_mask, read_mask_file
 from vg2gt.io.images import color_image, has_alpha
 from vg2gt.io.record3d import R3D, is_archive, read_recorded, recorded_files
 from vg2gt.io.video import VIDEO_SUFFIXES, VideoFrames, count_frames, read_video, require_pyav, video_size
@@ -109,7 +109,9 @@ def find_pictures(
     report_damaged(damaged, skip_damaged)
     if not chosen:
         raise ValueError("there are no images to reconstruct; give image files, a folder of them, or a video")
-    return with_unique_names(evenly(chosen, max_images))
+    taken = evenly(chosen, max_images)
+    _warn_without_mask([picture.path for picture in taken if picture.path is not None])
+    return with_unique_names(taken)
 
 
 def check_pictures(images: ImagesLike, skip_damaged: bool = False) -> None:
@@ -227,12 +229,24 @@ def mask_file(path: Path) -> Path | None:
     return next((file for file in files if file is not None), None)
 
 
+def _warn_without_mask(photos: Sequence[Path]) -> None:
+    """Warns about photographs without a mask next to a folder of masks."""
+    folders = {place / MASKS for photo in photos for place in (photo.parent, photo.parent.parent)}
+    known = sorted(str(folder) for folder in folders if folder.is_dir())
+    lacking = [photo.name for photo in photos if mask_file(photo) is None] if known else []
+    if lacking:
+        log.warning(
+            "%d of %d images have no mask in %s; all their pixels are used: %s",
+            len(lacking), len(photos), " or ".join(known), ", ".join(lacking[:10]),
+        )  # fmt: skip
+
+
 def mask_for(path: Path, upright: bool = True, content: bytes | None = None) -> NDArray[np.float32] | None:
     """Returns the pixel weights of a photograph: the product of its alpha and its mask file (:func:`mask_file`)."""
     parts = [read_mask(path, "", content=content, upright=upright)]
     file = mask_file(path)
     if content is None and file is not None:
-        parts.append(read_mask(file, "", upright=upright, is_mask=True))
+        parts.append(read_mask_file(file, "", path if upright else None))
     return joined_masks(parts)
 
 

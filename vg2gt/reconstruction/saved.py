@@ -14,7 +14,7 @@ from vg2gt.io.arrays import npz_names, read_npz
 from vg2gt.io.cameras_json import NamedCamera
 from vg2gt.io.errors import FormatError
 from vg2gt.io.files import read_json
-from vg2gt.io.images import open_image
+from vg2gt.io.image_files import read_color, read_mask
 from vg2gt.reconstruction.camera_paths import view_stem
 from vg2gt.reconstruction.frame import SceneFrame
 from vg2gt.reconstruction.output_names import PREDICTED
@@ -47,9 +47,9 @@ def read_scene(folder: str | Path, renderer: Renderer, device: torch.device | st
     named = read_cameras_json(folder / "cameras.json")
     cameras = _cameras(folder, named).to(device)
     if (folder / "views.npz").is_file():
-        images, depth, conf, mask = _read_views(folder / "views.npz", len(named), cameras.size)
+        images, depth, conf, mask = _read_views(folder / "views.npz", named, cameras.size)
     else:
-        images, mask = _read_images(folder / "images", named), None
+        images, mask = _read_images(folder / "images", named)
         depth = _rendered_depth(renderer, gaussians, cameras)
         conf = torch.ones_like(depth)
     cameras_from, metres = str(report.get("cameras", PREDICTED)), named[0].metres_per_unit
@@ -92,11 +92,16 @@ def _cameras(folder: Path, named: list[NamedCamera]) -> Cameras:
     return Cameras(poses, intrinsics, sizes[0])
 
 
-def _read_views(path: Path, views: int, size: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+def _read_views(
+    path: Path, named: list[NamedCamera], size: tuple[int, int]
+) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+    views, names = len(named), [view_stem(camera.name) for camera in named]
     try:
         arrays, mask = read_npz(path, ARRAYS), None
         if "mask" in npz_names(path):
             mask = torch.from_numpy(read_npz(path, ["mask"])["mask"].astype(np.float32))
+        if "names" in npz_names(path) and read_npz(path, ["names"])["names"].tolist() != names:
+            raise FormatError("it is of other images than cameras.json next to it")
     except (KeyError, FormatError) as error:
         raise FormatError(f"{path}: {error}; write it again with vg2gt reconstruct --save views.npz") from error
     shapes = {name: (views, *size, *([3] if name == "images" else [])) for name in ARRAYS}
@@ -123,8 +128,8 @@ def _trust(path: Path, shape: tuple[int, ...]) -> dict[str, Tensor]:
     return {name: torch.from_numpy(array) for name, array in arrays.items()}
 
 
-def _read_images(folder: Path, named: list[NamedCamera]) -> Tensor:
-    images = []
+def _read_images(folder: Path, named: list[NamedCamera]) -> tuple[Tensor, Tensor | None]:
+    images, masks = [], []
     for camera in named:
         path = folder / camera.name
         if not path.is_file():
@@ -132,14 +137,17 @@ def _read_images(folder: Path, named: list[NamedCamera]) -> Tensor:
                 f"{folder.parent} has no views.npz and no images/{camera.name}, so there is nothing to refine on: "
                 "reconstruct with --save scene.ply,cameras.json,views.npz"
             )
-        picture = open_image(path).convert("RGB")
-        if (picture.height, picture.width) != (camera.height, camera.width):
+        size, pixels = (camera.height, camera.width), read_color(path, "", upright=True)
+        if pixels.shape[:2] != size:
             raise ValueError(
-                f"{path} has {picture.height}x{picture.width} pixels, its camera {camera.height}x{camera.width}; "
+                f"{path} has {pixels.shape[0]}x{pixels.shape[1]} pixels, its camera {size[0]}x{size[1]}; "
                 "resize one of them"
             )
-        images.append(torch.from_numpy(np.asarray(picture).copy()).permute(2, 0, 1).float() / 255)
-    return torch.stack(images)
+        images.append(torch.from_numpy(pixels).permute(2, 0, 1).float() / 255)
+        mask = read_mask(path, "", upright=True)
+        masks.append(torch.ones(size) if mask is None else torch.from_numpy(mask))
+    weights = torch.stack(masks)
+    return torch.stack(images), None if bool((weights == 1).all()) else weights
 
 
 @torch.no_grad()

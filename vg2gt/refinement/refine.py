@@ -146,16 +146,22 @@ class _Refinement:
         self.order = ViewOrder(len(seen.images), options.holdout, options.seed)
         self.trained = self.order.trained.to(seen.images.device)
         self.options = options.of(len(self.order.trained))
+        given = gaussians
         if options.min_views:
             gaussians = supported(gaussians, cameras, seen.depth, options.min_views, options.merge_cells)
         self.limit = int(options.max_growth * len(gaussians))
         self.depth = _median_depth(gaussians, cameras, seen)
         self.pixel = 1 / float(cameras.intrinsics[..., [0, 1], [0, 1]].mean())
         ones = torch.ones_like(seen.images[:, :, 0, 0])
-        self.best = RefinedScene(_with_degree(gaussians, options.sh_degree), cameras, ones, torch.zeros_like(ones))
-        self.best = self.start = self.best.detach()
+        first = RefinedScene(_with_degree(gaussians, options.sh_degree), cameras, ones, torch.zeros_like(ones))
+        self.best = self.first = first.detach()
+        self.start = replace(self.first, gaussians=_with_degree(given, options.sh_degree)).detach()
         self.best_score, self.best_step = 1.0, 0
-        self.start_loss, self.start_psnr = self._score(self.best, torch.arange(len(ones)))
+        everything = torch.arange(len(ones))
+        self.first_loss, self.start_psnr = self._score(self.first, everything)
+        self.start_loss = self.first_loss
+        if options.min_views:
+            self.start_loss, self.start_psnr = self._score(self.start, everything)
         self.scores: list[float] = []
         self.checks: list[Check] = []
         self.recent: list[float] = []
@@ -195,8 +201,8 @@ class _Refinement:
     def _filled(self) -> RefinedScene:
         """Returns the initial state with its holes filled."""
         if not self.options.fill:
-            return self.start
-        start, side, room = self.start, self.options.fill, self.limit - len(self.start.gaussians)
+            return self.first
+        start, side, room = self.first, self.options.fill, self.limit - len(self.first.gaussians)
         filled = fill_holes(start.gaussians, start.cameras, self.seen, self.renderer, self.trained, side, room)
         return replace(start, gaussians=filled)
 
@@ -259,12 +265,12 @@ class _Refinement:
         scene = self.parameters.scene().detach()
         views = self.order.left_out if len(self.order.left_out) else self.order.trained
         loss, _ = self._score(scene, views)
-        score = float((loss / self.start_loss[views]).mean())
+        score = float((loss / self.first_loss[views]).mean())
         if not math.isfinite(score):
             return "the loss is not finite"
         if score > WORSE:
             best, _ = self._score(self.best, views)
-            if score > WORSE * float((best / self.start_loss[views]).mean()):
+            if score > WORSE * float((best / self.first_loss[views]).mean()):
                 return f"the loss of the left-out views is {score:.1f} times the initial one"
         self.scores = [*self.scores, score][-SMOOTH:]
         smooth = sum(self.scores) / len(self.scores)

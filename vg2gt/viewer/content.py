@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
-from vg2gt.io.arrays import read_npz
+from vg2gt.io.arrays import npz_names, read_npz
 from vg2gt.io.cameras_json import NamedCamera, invert_pose
 from vg2gt.io.glb import scene_extent
 from vg2gt.io.images import color_image, open_image
@@ -113,7 +113,7 @@ def load_view_pictures(cameras: Sequence[NamedCamera], path: Path) -> list[NDArr
     """Loads thumbnails of the cameras' images from a ``views.npz`` of the same scene.
 
     Returns:
-        One per camera; empty if there is no such file or it has another number of views.
+        One per camera; empty if there is no such file or it is of other images.
 
     Raises:
         ValueError: if the file cannot be read; the message names it.
@@ -121,8 +121,10 @@ def load_view_pictures(cameras: Sequence[NamedCamera], path: Path) -> list[NDArr
     if not path.is_file():
         return []
     try:
-        images = read_npz(path, ["images"])["images"]
-        pictures = [Image.fromarray(image) for image in images]
+        names = read_npz(path, ["names"])["names"].tolist() if "names" in npz_names(path) else None
+        if names is not None and names != [camera.name.removesuffix(".png") for camera in cameras]:
+            return []
+        pictures = [Image.fromarray(image) for image in read_npz(path, ["images"])["images"]]
     except Exception as error:  # damaged archives and arrays that are no images
         raise ValueError(f"cannot read {path}: {error}; restore or remove it") from error
     for picture in pictures:
@@ -133,8 +135,10 @@ def load_view_pictures(cameras: Sequence[NamedCamera], path: Path) -> list[NDArr
 def _small_picture(path: Path) -> NDArray[np.uint8]:
     try:
         with open_image(path) as image:
-            picture = color_image(image) if image.mode.startswith(("I", "F")) else image
+            if not image.mode.startswith(("I", "F")):
+                image.thumbnail((PICTURE_SIDE, PICTURE_SIDE))
+            picture = color_image(ImageOps.exif_transpose(image) or image)
             picture.thumbnail((PICTURE_SIDE, PICTURE_SIDE))
-            return np.array((ImageOps.exif_transpose(picture) or picture).convert("RGB"))
+            return np.array(picture)
     except Exception as error:  # image libraries raise many kinds of errors
         raise ValueError(f"cannot read {path}: {error}; restore or remove the image") from error

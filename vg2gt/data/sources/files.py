@@ -23,7 +23,7 @@ from vg2gt.data.sources.parsing import expanded
 from vg2gt.data.sources.undistortion import undistortion_of
 from vg2gt.data.transforms import from_bytes, resize_depth, resize_images, resize_to_cover
 from vg2gt.io.files import write_cached
-from vg2gt.io.image_files import Size, read_color, read_depth, read_mask
+from vg2gt.io.image_files import Size, read_color, read_depth, read_mask, read_mask_file
 
 log = logging.getLogger(__name__)
 
@@ -147,7 +147,7 @@ class FileSource(SceneSource):
         path, upright = index.mask(row), index.upright(row)
         parts = [read_mask(index.color[row], index.name, upright=upright)]
         if path is not None:
-            parts.append(read_mask(path, index.name, upright=upright, is_mask=True))
+            parts.append(read_mask_file(path, index.name, index.color[row] if upright else None))
         mask = joined_masks(parts)
         if mask is None or not (lens := index.lens(row)):
             return mask

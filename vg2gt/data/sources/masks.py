@@ -15,7 +15,7 @@ from vg2gt.io.image_files import Size
 log = logging.getLogger(__name__)
 
 FOLDER = "masks"
-_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp")
+_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".PNG", ".JPG", ".JPEG", ".BMP")
 
 
 def mask_of(folder: Path, name: str) -> Path | None:
@@ -26,7 +26,7 @@ def mask_of(folder: Path, name: str) -> Path | None:
         name: name of the image, relative to the image folder.
     """
     stem = folder / name
-    candidates = [Path(f"{stem}.png"), *(stem.with_suffix(ending) for ending in _ENDINGS), stem]
+    candidates = [Path(f"{stem}.png"), Path(f"{stem}.PNG"), *(stem.with_suffix(ending) for ending in _ENDINGS), stem]
     return next((path for path in candidates if path.is_file()), None)
 
 
