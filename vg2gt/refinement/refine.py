@@ -158,8 +158,8 @@ class _Refinement:
         self.start = replace(self.first, gaussians=_with_degree(given, options.sh_degree)).detach()
         self.best_score, self.best_step = 1.0, 0
         everything = torch.arange(len(ones))
-        self.first_loss, self.start_psnr = self._score(self.first, everything)
-        self.start_loss = self.first_loss
+        self.first_loss, self.first_psnr = self._score(self.first, everything)
+        self.start_loss, self.start_psnr = self.first_loss, self.first_psnr
         if options.min_views:
             self.start_loss, self.start_psnr = self._score(self.start, everything)
         self.scores: list[float] = []
@@ -180,9 +180,13 @@ class _Refinement:
             ended = "interrupted"
         loss, after = self._score(self.best, torch.arange(len(self.seen.images)))
         trained = self.order.trained
-        if not loss[trained].mean() <= self.start_loss[trained].mean():  # left-out views can improve by chance
+        before = self.start_psnr[trained].mean()
+        if not loss[trained].mean() <= self.first_loss[trained].mean():  # left-out views can improve by chance
+            self.best, self.best_step, loss, after = self.first, 0, self.first_loss, self.first_psnr
+        better = loss[trained].mean() <= self.start_loss[trained].mean() or after[trained].mean() > before
+        if not better:  # too few steps to make up for the Gaussians that were left out at the start
             self.best, self.best_step, after = self.start, 0, self.start_psnr
-        elif self.options.rates.cameras:
+        elif self.options.rates.cameras and self.best_step:
             self.best = self.best.seen_from(self.start.cameras.world_to_camera[0, 0])
         return Refined(
             start=self.start,
