@@ -164,7 +164,8 @@ def test_worse_than_the_best_state_is_no_divergence(
     start: Start, last: float, retreats: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A check that is worse than the best state, but better than a poor start, is no reason to fall back."""
-    losses = iter([1.0, 0.3, 0.3, last, 0.3, 0.3, 0.3, 0.3])  # of the start, checks, and the best state or the end
+    # of the given scene, the start, checks, and the best state or the end
+    losses = iter([1.0, 1.0, 0.3, 0.3, last, 0.3, 0.3, 0.3, 0.3])
 
     def score(self, scene: RefinedScene, views: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         loss = torch.full((len(views),), next(losses))

@@ -32,7 +32,10 @@ def main(argv: Sequence[str] | None = None) -> None:
     arguments = parser.parse_args(argv)
     if arguments.html is not None and (arguments.host, arguments.port, arguments.share) != (None, None, False):
         parser.error("--html writes a file and starts no server; omit --host, --port and --share")
-    if arguments.images is not None and arguments.cameras is None and not (arguments.scene.parent / CAMERAS).is_file():
+    known = arguments.scene.parent / CAMERAS
+    if arguments.cameras is None and known.is_file():
+        arguments.cameras = known
+    if arguments.images is not None and arguments.cameras is None:
         parser.error("--images requires --cameras, which lists the image names")
     with errors_in_one_line():
         if arguments.html is None:
@@ -86,10 +89,9 @@ def _scene(arguments: argparse.Namespace) -> ViewerScene:
     if arguments.color is not None:
         gaussians = _by_trust(arguments.scene, gaussians)
     title = arguments.title or arguments.scene.name
-    path = arguments.cameras or arguments.scene.parent / CAMERAS
-    if arguments.cameras is None and not path.is_file():
+    if arguments.cameras is None:
         return ViewerScene(gaussians, title=title)
-    cameras, near = read_cameras(path), path.parent
+    cameras, near = read_cameras(arguments.cameras), arguments.cameras.parent
     sources = [arguments.images] if arguments.images is not None else [near, near / IMAGE_FOLDER, near / VIEWS]
     return ViewerScene(gaussians, cameras, _pictures(cameras, sources), title)
 

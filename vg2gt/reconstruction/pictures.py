@@ -20,7 +20,7 @@ from torch import Tensor
 
 from vg2gt.data.base import DataError, Frames
 from vg2gt.data.sources.masks import FOLDER as MASKS
-from vg2gt.data.sources.masks import joined_masks, mask_of, resized_mask
+from vg2gt.data.sources.masks import joined_masks, mask_of, resized_mask, warn_without_mask
 from vg2gt.data.sources.parsing import IMAGE_SUFFIXES
 from vg2gt.data.transforms import from_bytes
 from vg2gt.io.files import by_number
@@ -110,7 +110,7 @@ def find_pictures(
     if not chosen:
         raise ValueError("there are no images to reconstruct; give image files, a folder of them, or a video")
     taken = evenly(chosen, max_images)
-    _warn_without_mask([picture.path for picture in taken if picture.path is not None])
+    _check_masks([picture.path for picture in taken if picture.path is not None])
     return with_unique_names(taken)
 
 
@@ -229,16 +229,13 @@ def mask_file(path: Path) -> Path | None:
     return next((file for file in files if file is not None), None)
 
 
-def _warn_without_mask(photos: Sequence[Path]) -> None:
+def _check_masks(photos: Sequence[Path]) -> None:
     """Warns about photographs without a mask next to a folder of masks."""
     folders = {place / MASKS for photo in photos for place in (photo.parent, photo.parent.parent)}
-    known = sorted(str(folder) for folder in folders if folder.is_dir())
-    lacking = [photo.name for photo in photos if mask_file(photo) is None] if known else []
-    if lacking:
-        log.warning(
-            "%d of %d images have no mask in %s; all their pixels are used: %s",
-            len(lacking), len(photos), " or ".join(known), ", ".join(lacking[:10]),
-        )  # fmt: skip
+    known = sorted(folder for folder in folders if folder.is_dir())
+    if known:
+        lacking = [photo.name for photo in photos if mask_file(photo) is None]
+        warn_without_mask(lacking, len(photos), known[0], "masks")
 
 
 def mask_for(path: Path, upright: bool = True, content: bytes | None = None) -> NDArray[np.float32] | None:

@@ -72,7 +72,7 @@ class Refined:
     """Result of a refinement.
 
     Attributes:
-        start: initial state.
+        start: the given scene.
         scene: best state, in the frame in which the camera of view 0 has its initial pose.
         step: step at which it was reached.
         steps: number of steps made.
@@ -146,22 +146,21 @@ class _Refinement:
         self.order = ViewOrder(len(seen.images), options.holdout, options.seed)
         self.trained = self.order.trained.to(seen.images.device)
         self.options = options.of(len(self.order.trained))
-        given = gaussians
+        start = gaussians
         if options.min_views:
-            gaussians = supported(gaussians, cameras, seen.depth, options.min_views, options.merge_cells)
-        self.limit = int(options.max_growth * len(gaussians))
-        self.depth = _median_depth(gaussians, cameras, seen)
+            start = supported(gaussians, cameras, seen.depth, options.min_views, options.merge_cells)
+        self.limit = int(options.max_growth * len(start))
+        self.depth = _median_depth(start, cameras, seen)
         self.pixel = 1 / float(cameras.intrinsics[..., [0, 1], [0, 1]].mean())
         ones = torch.ones_like(seen.images[:, :, 0, 0])
-        first = RefinedScene(_with_degree(gaussians, options.sh_degree), cameras, ones, torch.zeros_like(ones))
-        self.best = self.first = first.detach()
-        self.start = replace(self.first, gaussians=_with_degree(given, options.sh_degree)).detach()
-        self.best_score, self.best_step = 1.0, 0
-        everything = torch.arange(len(ones))
-        self.first_loss, self.first_psnr = self._score(self.first, everything)
-        self.start_loss, self.start_psnr = self.first_loss, self.first_psnr
-        if options.min_views:
-            self.start_loss, self.start_psnr = self._score(self.start, everything)
+        self.given, self.start = (
+            RefinedScene(_with_degree(each, options.sh_degree), cameras, ones, torch.zeros_like(ones)).detach()
+            for each in (gaussians, start)
+        )
+        views = torch.arange(len(ones))
+        self.given_loss, self.given_psnr = self._score(self.given, views)
+        self.start_loss, self.start_psnr = self._score(self.start, views)
+        self.best, self.best_score, self.best_step = self.start, 1.0, 0
         self.scores: list[float] = []
         self.checks: list[Check] = []
         self.recent: list[float] = []
@@ -180,22 +179,22 @@ class _Refinement:
             ended = "interrupted"
         loss, after = self._score(self.best, torch.arange(len(self.seen.images)))
         trained = self.order.trained
-        before = self.start_psnr[trained].mean()
-        if not loss[trained].mean() <= self.first_loss[trained].mean():  # left-out views can improve by chance
-            self.best, self.best_step, loss, after = self.first, 0, self.first_loss, self.first_psnr
-        better = loss[trained].mean() <= self.start_loss[trained].mean() or after[trained].mean() > before
-        if not better:  # too few steps to make up for the Gaussians that were left out at the start
-            self.best, self.best_step, after = self.start, 0, self.start_psnr
+        if not loss[trained].mean() <= self.start_loss[trained].mean():  # left-out views can improve by chance
+            self.best, self.best_step, loss, after = self.start, 0, self.start_loss, self.start_psnr
+        closer = after[trained].mean() > self.given_psnr[trained].mean()
+        if not (closer or loss[trained].mean() <= self.given_loss[trained].mean()):
+            # too few steps to make up for the Gaussians that were left out at the start
+            self.best, self.best_step, after = self.given, 0, self.given_psnr
         elif self.options.rates.cameras and self.best_step:
-            self.best = self.best.seen_from(self.start.cameras.world_to_camera[0, 0])
+            self.best = self.best.seen_from(self.given.cameras.world_to_camera[0, 0])
         return Refined(
-            start=self.start,
+            start=self.given,
             scene=self.best,
             step=self.best_step,
             steps=self.steps,
             seconds=self.clock() - self.began,
             ended=ended,
-            psnr=torch.stack((self.start_psnr, after)),
+            psnr=torch.stack((self.given_psnr, after)),
             trained=self.order.trained,
             held_out=self.order.held_out,
             checks=tuple(self.checks),
@@ -205,8 +204,8 @@ class _Refinement:
     def _filled(self) -> RefinedScene:
         """Returns the initial state with its holes filled."""
         if not self.options.fill:
-            return self.first
-        start, side, room = self.first, self.options.fill, self.limit - len(self.first.gaussians)
+            return self.start
+        start, side, room = self.start, self.options.fill, self.limit - len(self.start.gaussians)
         filled = fill_holes(start.gaussians, start.cameras, self.seen, self.renderer, self.trained, side, room)
         return replace(start, gaussians=filled)
 
@@ -269,12 +268,12 @@ class _Refinement:
         scene = self.parameters.scene().detach()
         views = self.order.left_out if len(self.order.left_out) else self.order.trained
         loss, _ = self._score(scene, views)
-        score = float((loss / self.first_loss[views]).mean())
+        score = float((loss / self.start_loss[views]).mean())
         if not math.isfinite(score):
             return "the loss is not finite"
         if score > WORSE:
             best, _ = self._score(self.best, views)
-            if score > WORSE * float((best / self.first_loss[views]).mean()):
+            if score > WORSE * float((best / self.start_loss[views]).mean()):
                 return f"the loss of the left-out views is {score:.1f} times the initial one"
         self.scores = [*self.scores, score][-SMOOTH:]
         smooth = sum(self.scores) / len(self.scores)

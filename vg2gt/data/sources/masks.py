@@ -15,7 +15,7 @@ from vg2gt.io.image_files import Size
 log = logging.getLogger(__name__)
 
 FOLDER = "masks"
-_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".PNG", ".JPG", ".JPEG", ".BMP")
+_ENDINGS = tuple(each for ending in (".png", ".jpg", ".jpeg", ".bmp") for each in (ending, ending.upper()))
 
 
 def mask_of(folder: Path, name: str) -> Path | None:
@@ -41,13 +41,17 @@ def find_masks(folder: Path, names: Mapping[int, str], where: str) -> dict[int, 
     if not folder.is_dir():
         return {}
     found = {number: mask_of(folder, name) for number, name in names.items()}
-    lacking = [names[number] for number, path in found.items() if path is None]
+    warn_without_mask([names[number] for number, path in found.items() if path is None], len(names), folder, where)
+    return {number: path for number, path in found.items() if path is not None}
+
+
+def warn_without_mask(lacking: Sequence[str], count: int, folder: Path, where: str) -> None:
+    """Warns about ``lacking`` of ``count`` images, if any, that have no mask in a folder of masks."""
     if lacking:
         log.warning(
             "%s: %d of %d images have no mask in %s; all their pixels are used: %s",
-            where, len(lacking), len(names), folder, ", ".join(lacking[:10]),
+            where, len(lacking), count, folder, ", ".join(lacking[:10]),
         )  # fmt: skip
-    return {number: path for number, path in found.items() if path is not None}
 
 
 def joined_masks(masks: Sequence[NDArray[np.float32] | None]) -> NDArray[np.float32] | None:
