@@ -55,6 +55,7 @@ SEED = 0
 _MODEL = "SIMPLE_RADIAL"
 _QUALITY = 95  # JPEG quality of the kept images
 _AT_ONCE = 4  # images per batch of feature extraction, to bound memory
+_PAIRS_AT_ONCE = 256  # pairs per call of the matcher, which indexes the features of every image in each call
 _STATE = "sfm.json"
 _MASKS = "masks"
 
@@ -272,15 +273,13 @@ def _find_features(
 
 
 def _match(work: Path, names: Sequence[str], monitor: Monitor) -> None:
-    """Matches each image with all earlier ones, or, if there are many images, likely pairs only."""
+    """Matches all pairs of images, or, if there are many images, likely pairs only."""
     import pycolmap  # pyright: ignore[reportMissingImports]
 
     database = work / "database.db"
-    earlier = {later: list(range(later)) for later in range(1, len(names))}
+    chosen = [(before, later) for later in range(len(names)) for before in range(later)]
     if len(names) > ALL_PAIRS:
-        earlier = {}
-        for before, later in likely_pairs(_descriptors(database, names), SEED):
-            earlier.setdefault(later, []).append(before)
+        chosen = likely_pairs(_descriptors(database, names), SEED)
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu = False
     matching.num_threads = _threads()
@@ -288,9 +287,10 @@ def _match(work: Path, names: Sequence[str], monitor: Monitor) -> None:
     checking.ransac.random_seed = SEED
     pairs = pycolmap.ImportedPairingOptions()
     pairs.match_list_path = work / "pairs.txt"
-    with monitor.stage("match features", len(earlier)) as advance:
-        for later, before in earlier.items():
-            (work / "pairs.txt").write_text("".join(f"{names[number]} {names[later]}\n" for number in before))
+    parts = [chosen[start : start + _PAIRS_AT_ONCE] for start in range(0, len(chosen), _PAIRS_AT_ONCE)]
+    with monitor.stage("match features", len(parts)) as advance:
+        for part in parts:
+            (work / "pairs.txt").write_text("".join(f"{names[before]} {names[later]}\n" for before, later in part))
             pycolmap.match_image_pairs(
                 database,
                 matching_options=matching,
