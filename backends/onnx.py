@@ -1,24 +1,240 @@
-"""Backend from an ONNX bundle: the encoder runs in onnxruntime, the decoder is a differentiable torch module."""
+"""ONNX bundles: folders with a frozen network split into encoder and decoder; written by ``vg2gt export``.
+
+The encoder runs in onnxruntime, the decoder is rebuilt as a torch module from its class and arguments.
+"""
 
 from __future__ import annotations
 
+import importlib.util
 import os
+import tempfile
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import onnxruntime
 import torch
-from torch import Tensor
+from safetensors.torch import save_file
+from torch import Tensor, nn
+from torch.export import Dim
 
 from backends.base import Backend
-from backends.bundle import DECODER, DECODER_WEIGHTS, ENCODER, REMEDY, load_decoder, read_bundle
+from backends.da3.backend import DA3Backend, DA3Decoder
+from backends.vggt import VGGTBackend, VGGTDecoder
+from backends.weights import load_strictly
+from vg2gt.io.files import read_json, write_json
+from vg2gt.io.tensors import read_tensors
 from vg2gt.types import Cameras, Geometry, Hints, Tokens
 
+Exportable = VGGTBackend | DA3Backend
 Provider = Literal["auto", "cpu", "cuda"]
+
+DESCRIPTION = "backend.json"
+ENCODER, DECODER, DECODER_WEIGHTS = "encoder.onnx", "decoder.onnx", "decoder.safetensors"
+REMEDY = "write it with vg2gt export backend=NAME --out FOLDER"
+DECODERS = {kind.__name__: kind for kind in (VGGTDecoder, DA3Decoder)}  # the only classes that are built from a file
 DECODED = ("depth", "depth_conf", "world_to_camera", "intrinsics")
-CUDA, CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
+CUDA = "CUDAExecutionProvider"
+
+TRACED = (2, 3, 4, 6)  # traced scenes, views, patch rows, patch columns: all different, none 1
+CHECKED = ((1, 1, 3, 2), (1, 2, 2, 5), (2, 4, 3, 3))
+TOLERANCE = 1e-3  # relative error; a correct graph differs by about 1e-6, a wrong one by far more than 1e-3
+
+
+@dataclass(frozen=True)
+class Description:
+    """Content of ``backend.json``.
+
+    Attributes:
+        name: name of the exported backend.
+        licence: licence of its weights.
+        weights: sha256 of its weights (``Backend.identity``), which checkpoints are matched with.
+        patch_size: edge of a patch in pixels.
+        token_dims: channels of the patch tokens, in tap order.
+        needs_hints: whether the encoder also takes ``world_to_camera`` and ``intrinsics``.
+        decoder: ``class`` and ``arguments`` to rebuild the decoder.
+        max_difference: largest relative difference to torch at export, of ``encoder`` and ``decoder``.
+    """
+
+    name: str
+    licence: str
+    weights: str
+    patch_size: int
+    token_dims: list[int]
+    needs_hints: bool
+    decoder: dict[str, Any]
+    max_difference: dict[str, float]
+
+
+class Graph(nn.Module):
+    """Part of a backend as a function of tensors, for export."""
+
+    def __init__(self, backend: Exportable) -> None:
+        super().__init__()
+        self.backend = backend
+
+
+class EncoderGraph(Graph):
+    """Images, and cameras if used, to patch tokens ``[B, V, h, w, D]`` and a camera token."""
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """Encodes ``[B, V, 3, H, W]`` images; world-to-camera matrices and intrinsics follow if they are used."""
+        images, *cameras = inputs
+        hints = Hints(cameras=Cameras(*cameras, (images.shape[-2], images.shape[-1]))) if cameras else None
+        tokens = self.backend.encode_checked(images, hints)
+        return (*(tap.unflatten(2, tokens.grid) for tap in tokens.patch), tokens.camera)
+
+
+class DecoderGraph(Graph):
+    """Patch tokens ``[B, V, h, w, D]`` and a camera token to depth, confidence and cameras."""
+
+    def forward(self, *tokens: Tensor) -> tuple[Tensor, ...]:
+        """Decodes all views at once; the camera token is the last argument."""
+        *patch, camera = tokens
+        grid = (patch[0].shape[2], patch[0].shape[3])
+        size = (grid[0] * self.backend.patch_size, grid[1] * self.backend.patch_size)
+        flat = tuple(tap.flatten(2, 3) for tap in patch)
+        geometry = self.backend.network.decode(Tokens(flat, camera, grid, size), None)
+        return geometry.depth, geometry.depth_conf, geometry.cameras.world_to_camera, geometry.cameras.intrinsics
+
+
+def export(backend: Backend, out: Path) -> Description:
+    """Exports a bundle, and verifies it against torch at sizes other than the traced one.
+
+    Args:
+        backend: backend to export, on the CPU.
+        out: output folder; must not exist or be empty.
+
+    Returns:
+        The content of ``backend.json``.
+
+    Raises:
+        ValueError: if the backend cannot be exported.
+        FileExistsError: if ``out`` is not empty.
+        RuntimeError: if onnxruntime's results differ from torch's.
+        ImportError: if ``onnx`` or ``onnxscript`` is not installed.
+    """
+    if not isinstance(backend, VGGTBackend | DA3Backend):
+        raise ValueError(f"backend {backend.name} cannot be exported, only VGGT and the relative DA3 networks")
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise FileExistsError(f"{out} exists already: remove it or choose another out=FOLDER")
+    if not all(importlib.util.find_spec(package) for package in ("onnx", "onnxscript")):
+        raise ImportError("export needs onnx and onnxscript: pip install 'vg2gt[export]'")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as temporary:
+        folder = Path(temporary, "bundle")
+        folder.mkdir()
+        description = _write(backend, folder)
+        os.replace(folder, out)
+    return description
+
+
+def _write(backend: Exportable, folder: Path) -> Description:
+    kind = "VGGTDecoder" if isinstance(backend, VGGTBackend) else "DA3Decoder"
+    with torch.device("meta"):
+        names = DECODERS[kind](**backend.network.arguments).state_dict()
+    state = backend.network.state_dict()
+    save_file({name: state[name].contiguous() for name in names}, folder / DECODER_WEIGHTS)
+    description = Description(
+        name=backend.name,
+        licence=backend.licence,
+        weights=backend.identity()["weights"],
+        patch_size=backend.patch_size,
+        token_dims=list(backend.token_dims),
+        needs_hints=backend.needs_hints,
+        decoder={"class": kind, "arguments": backend.network.arguments},
+        max_difference=_export_graphs(backend, folder),
+    )
+    write_json(folder / DESCRIPTION, asdict(description))
+    return description
+
+
+def _export_graphs(backend: Exportable, folder: Path) -> dict[str, float]:
+    """Writes both graphs; returns their largest :func:`relative_difference` to torch, at sizes not traced."""
+    encoder, decoder = EncoderGraph(backend).eval(), DecoderGraph(backend).eval()
+    tokens = token_names(len(backend.token_dims))
+    names = ["images", "world_to_camera", "intrinsics"][: 3 if backend.needs_hints else 1]
+    worst = {"encoder": 0.0, "decoder": 0.0}
+    with torch.no_grad():
+        inputs = example_inputs(backend, *TRACED)
+        export_graph(encoder, inputs, names, tokens, folder / ENCODER)
+        export_graph(decoder, encoder(*inputs), tokens, DECODED, folder / DECODER)
+        sessions = [open_session(folder / file, "cpu") for file in (ENCODER, DECODER)]
+        for shape in CHECKED:
+            inputs = example_inputs(backend, *shape)
+            encoded = encoder(*inputs)
+            found = run_session(sessions[0], dict(zip(names, inputs, strict=True)), tokens)
+            worst["encoder"] = max(worst["encoder"], *map(relative_difference, found, encoded))
+            found = run_session(sessions[1], dict(zip(tokens, encoded, strict=True)), DECODED)
+            worst["decoder"] = max(worst["decoder"], *map(relative_difference, found, decoder(*encoded)))
+    if max(worst.values()) > TOLERANCE:
+        raise RuntimeError(f"the exported graphs differ from torch: {worst}")
+    return worst
+
+
+def example_inputs(backend: Exportable, scenes: int, views: int, rows: int, columns: int) -> tuple[Tensor, ...]:
+    """Returns random images with the given number of patches and, if the backend uses them, cameras on a line."""
+    size = (rows * backend.patch_size, columns * backend.patch_size)
+    images = torch.rand(scenes, views, 3, *size, generator=torch.Generator().manual_seed(0))
+    if not backend.needs_hints:
+        return (images,)
+    poses = torch.eye(4).repeat(scenes, views, 1, 1)
+    poses[..., 0, 3] = torch.arange(views)
+    intrinsics = torch.tensor([[size[1], 0, size[1] / 2], [0, size[1], size[0] / 2], [0, 0, 1]])
+    return images, poses, intrinsics.repeat(scenes, views, 1, 1)
+
+
+def export_graph(
+    graph: nn.Module, inputs: tuple[Tensor, ...], names: Sequence[str], results: Sequence[str], file: Path
+) -> None:
+    """Exports a graph to ``file``; all axes are dynamic except channels and the rows and columns of matrices."""
+    from onnx_ir.passes.common import ClearMetadataAndDocStringPass
+
+    axes = {"images": (0, 1, 3, 4), "world_to_camera": (0, 1), "intrinsics": (0, 1), "camera": (0, 1)}
+    free = tuple(dict.fromkeys(axes.get(name, (0, 1, 2, 3)), Dim.AUTO) for name in names)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        program = torch.onnx.export(
+            torch.export.export(graph, inputs, dynamic_shapes=(free,), strict=False),
+            input_names=names,
+            output_names=results,
+            dynamo=True,
+            verbose=False,
+            optimize=False,
+            custom_translation_table={torch.ops.aten.scaled_dot_product_attention.default: _attention},
+        )
+    assert program is not None
+    ClearMetadataAndDocStringPass()(program.model)  # removes stack traces, which hold local paths
+    program.save(file)
+
+
+def _attention(query: Any, key: Any, value: Any) -> Any:
+    """Attention on ``[B, heads, N, head_dim]`` as onnxruntime's operator, which never stores the ``N x N`` weights."""
+    from onnx.defs import OpSchema
+    from onnxscript import opset18
+    from onnxscript.values import Op, Opset
+
+    op: Any = opset18  # its type hints reject single constant attributes
+    # the part of onnxruntime's documented schema that is used here
+    *inputs, output = (OpSchema.FormalParameter(name, "T") for name in ("query", "key", "value", "output"))
+    attributes = [OpSchema.Attribute("num_heads", OpSchema.AttrType.INT, "")]
+    kinds = {"type_constraints": [("T", ["tensor(float)"], "")], "attributes": attributes}
+    schema = OpSchema("MultiHeadAttention", "com.microsoft", 1, inputs=inputs, outputs=[output], **kinds)
+    attend = Op(Opset(schema.domain, 1), schema.name, schema)
+    heads = int(query.shape[1])
+    turned = [op.Transpose(each, perm=[0, 2, 1, 3]) for each in (query, key, value)]
+    joined = [op.Reshape(each, op.Constant(value_ints=[0, 0, -1])) for each in turned]  # [B, N, heads * head_dim]
+    out = op.Reshape(attend(*joined, num_heads=heads), op.Constant(value_ints=[0, 0, heads, -1]))
+    return op.Transpose(out, perm=[0, 2, 1, 3])
+
+
+def relative_difference(found: Tensor, expected: Tensor) -> float:
+    """Returns max|found - expected| / max|expected|; infinity if the shapes differ or a value is NaN."""
+    if found.shape != expected.shape or found.isnan().any():
+        return float("inf")
+    return float((found - expected).abs().max() / expected.abs().max())
 
 
 class OnnxBackend(Backend):
@@ -44,7 +260,7 @@ class OnnxBackend(Backend):
         if provider not in get_args(Provider):
             raise ValueError(f"backend.provider is {provider!r}; choose one of {', '.join(get_args(Provider))}")
         folder = Path(path).expanduser()
-        description = read_bundle(folder)
+        description = read_description(folder)
         decoder = load_decoder(folder, description.decoder)
         super().__init__(
             description.name,
@@ -60,11 +276,7 @@ class OnnxBackend(Backend):
         self.encoder_session = open_session(folder / ENCODER, provider)
         self.decoder_session = open_session(folder / DECODER, provider) if decoder is None else None
         if decoder is None:
-            warnings.warn(
-                f"{folder} has no {DECODER_WEIGHTS}: backend {self.name} decodes without gradient, so the coarse "
-                "module is not trained through its depth",
-                stacklevel=2,
-            )
+            warnings.warn(f"{folder} has no {DECODER_WEIGHTS}: {self.name} decodes without gradient", stacklevel=2)
         print(f"{self.name}: ONNX bundle {folder}, licence: {self.licence}")
         self.freeze()
 
@@ -77,18 +289,16 @@ class OnnxBackend(Backend):
             cameras = self.require_hints(images, hints, "cameras").cameras
             assert cameras is not None
             inputs |= {"world_to_camera": cameras.world_to_camera, "intrinsics": cameras.intrinsics}
-        names = [*(f"patch_{index}" for index in range(len(self.token_dims))), "camera"]
-        *patch, camera = run_session(self.encoder_session, inputs, names)
-        grid = (patch[0].shape[2], patch[0].shape[3])
-        return Tokens(tuple(tap.flatten(2, 3) for tap in patch), camera, grid, (images.shape[-2], images.shape[-1]))
+        *patch, camera = run_session(self.encoder_session, inputs, token_names(len(self.token_dims)))
+        return self.as_tokens(images, [tap.flatten(2, 3) for tap in patch], camera)
 
     def decode(self, tokens: Tokens) -> Geometry:
         """See :meth:`Backend.decode`."""
         if self.decoder is not None:
             return self.decoder.decode(tokens, self.head_chunk)
         assert self.decoder_session is not None
-        inputs = {f"patch_{index}": tap.unflatten(2, tokens.grid) for index, tap in enumerate(tokens.patch)}
-        inputs |= {"camera": tokens.camera}
+        values = (*(tap.unflatten(2, tokens.grid) for tap in tokens.patch), tokens.camera)
+        inputs = dict(zip(token_names(len(tokens.patch)), values, strict=True))
         depth, confidence, world_to_camera, intrinsics = run_session(self.decoder_session, inputs, DECODED)
         cameras = Cameras(world_to_camera, intrinsics, tokens.size)
         return Geometry(depth, confidence, cameras, torch.ones_like(depth[:, 0, 0, 0]))
@@ -98,16 +308,54 @@ class OnnxBackend(Backend):
         return super().decode_cameras(tokens) if self.decoder is None else self.decoder.decode_cameras(tokens)
 
 
-def open_session(file: Path, provider: Provider) -> onnxruntime.InferenceSession:
-    """Opens an ONNX file on this process's GPU or on the CPU, with torch's number of threads.
+def token_names(taps: int) -> list[str]:
+    """Returns the names of the graphs' tokens: the patch tokens of every tap, and the camera token."""
+    return [*(f"patch_{index}" for index in range(taps)), "camera"]
+
+
+def read_description(folder: Path) -> Description:
+    """Reads the description of a bundle; only the decoder's weights may be missing from the folder.
 
     Raises:
-        ValueError: if onnxruntime cannot open the file.
-        RuntimeError: if ``provider`` is ``cuda`` and not available.
+        FileNotFoundError: if another file is missing.
+        ValueError: if the description is not valid.
     """
+    for name in (DESCRIPTION, ENCODER, DECODER):
+        if not (folder / name).is_file():
+            raise FileNotFoundError(f"{folder} is not an ONNX bundle, {name} is missing: copy all of it, or {REMEDY}")
+    try:
+        content = read_json(folder / DESCRIPTION)
+        return Description(**{field.name: content[field.name] for field in fields(Description)})
+    except (ValueError, RecursionError, KeyError, TypeError) as error:
+        raise ValueError(f"{folder / DESCRIPTION} does not describe a bundle ({error!r}): {REMEDY}") from error
+
+
+def load_decoder(folder: Path, decoder: Mapping[str, Any]) -> VGGTDecoder | DA3Decoder | None:
+    """Rebuilds the decoder of a bundle from its ``class`` and ``arguments``; returns None if there are no weights.
+
+    Raises:
+        ValueError: if the class is not one of :data:`DECODERS`, or the arguments or weights do not fit.
+    """
+    file = folder / DECODER_WEIGHTS
+    if not file.is_file():
+        return None
+    try:
+        with torch.device("meta"):
+            module = DECODERS[decoder["class"]](**decoder["arguments"])
+    except (KeyError, RuntimeError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"{folder / DESCRIPTION} does not describe a {' or '.join(DECODERS)} ({error!r}): {REMEDY}, or remove "
+            f"{DECODER_WEIGHTS} to decode without gradient"
+        ) from error
+    load_strictly(module, read_tensors(file), "", (), str(file))
+    return module
+
+
+def open_session(file: Path, provider: Provider) -> onnxruntime.InferenceSession:
+    """Opens an ONNX file on this process's GPU or the CPU, with torch's number of threads; errors as OnnxBackend's."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = torch.get_num_threads()
-    providers: list[str | tuple[str, dict[str, str]]] = [CPU]
+    providers: list[str | tuple[str, dict[str, str]]] = ["CPUExecutionProvider"]
     if provider != "cpu" and CUDA in onnxruntime.get_available_providers():
         # Plain float32 as in torch, not TF32. In distributed training, every process has its own GPU.
         providers.insert(0, (CUDA, {"device_id": os.environ.get("LOCAL_RANK", "0"), "use_tf32": "0"}))

@@ -77,6 +77,6 @@ def shallow_da3():
 @pytest.fixture(scope="session")
 def onnx_bundle(shallow_da3, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An exported network."""
-    from backends.export import export
+    from backends.onnx import export
 
     return made_once(tmp_path_factory, "onnx", lambda folder: export(shallow_da3, folder / "bundle")) / "bundle"

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from backends.bundle import CONVENTIONS, DECODER, DECODER_WEIGHTS, DESCRIPTION, ENCODER, Description
-from backends.onnx import OnnxBackend, open_session
+from backends.onnx import DECODER, DECODER_WEIGHTS, DESCRIPTION, ENCODER, OnnxBackend, open_session
 
 onnx = pytest.importorskip("onnx", reason="needs onnx: pip install 'vg2gt[export]'")
 from onnx import TensorProto, helper  # noqa: E402
@@ -37,12 +36,16 @@ HARMLESS_DECODER = network(helper.make_node("Identity", ["x"], ["y"]), outputs=O
 
 def describe(folder: Path, change: Callable[[dict[str, Any]], Any] = lambda content: None) -> None:
     """Writes a description, then changed."""
-    known = {"name": "da3_tiny", "licence": "mine", "weights": "0" * 64, "patch_size": 14, "token_dims": [4]}
-    known |= {"taps": [0], "needs_hints": False, "decoder": {"class": "DA3Decoder", "arguments": {}}}
-    Description(**known, conventions=CONVENTIONS, max_difference={}).write(folder)
-    content = json.loads((folder / DESCRIPTION).read_text())
-    change(content)
-    (folder / DESCRIPTION).write_text(json.dumps(content))
+    known: dict[str, Any] = {
+        "name": "da3_tiny",
+        "licence": "mine",
+        "weights": "0" * 64,
+        "patch_size": 14,
+        "token_dims": [4],
+    }
+    known |= {"needs_hints": False, "decoder": {"class": "DA3Decoder", "arguments": {}}, "max_difference": {}}
+    change(known)
+    (folder / DESCRIPTION).write_text(json.dumps(known))
 
 
 @pytest.fixture

@@ -33,7 +33,7 @@ ATTACKS: dict[str, Attack] = {
     "through a module of ours": lambda c: {"_target_": "vg2gt.kernels.threads.os.mkdir", "path": c},
     "a function of ours": lambda c: {"_target_": "vg2gt.io.files.write_text", "path": c, "content": ""},
     "training": lambda c: {"_target_": "vg2gt.training.loop.train", "config": {"output_dir": c}},
-    "a method of ours": lambda c: {"_target_": "backends.bundle.Description.write", "folder": c},
+    "a method of ours": lambda c: {"_target_": "vg2gt.uncertainty.calibration.Calibration.write", "path": c},
     "a class that writes": lambda c: {"_target_": "vg2gt.training.stop_on_signal.StopOnSignal", "folder": c},
     "a list": lambda c: [{"_target_": "os.mkdir", "path": c}],  # pyright: ignore[reportAssignmentType]
 }  # fmt: skip

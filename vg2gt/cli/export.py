@@ -27,7 +27,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     with errors_in_one_line():
         from hydra.utils import instantiate
 
-        from backends.export import export
+        from backends.onnx import export
 
         logging.getLogger("torch.onnx").setLevel(logging.ERROR)
         description = export(instantiate(compose_groups(*overrides).backend), out.expanduser())
