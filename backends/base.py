@@ -110,10 +110,6 @@ class Backend(nn.Module, ABC):
         if not self.frozen:
             self.identity()
 
-    def gradients(self) -> torch.set_grad_enabled:
-        """Returns a context that disables gradients if the network is frozen."""
-        return torch.set_grad_enabled(torch.is_grad_enabled() and not self.frozen)
-
     def train(self, mode: bool = True) -> Backend:
         """Stays in eval mode whatever ``mode`` is."""
         return super().train(False)
@@ -164,44 +160,31 @@ class Backend(nn.Module, ABC):
         Raises:
             ValueError: if a field is missing or has the wrong shape, or cameras are not valid.
         """
-        batch, views, _, height, width = images.shape
-        missing = [name for name in names if _is_missing(getattr(hints, name, None))]
+        missing = [name for name in names if getattr(hints, name, None) is None]
         if hints is None or missing:
             raise ValueError(
                 f"backend {self.name} needs hints from the data, missing: {', '.join(missing)}. Pass batch.hints, "
                 "or choose a backend that works from images alone (backend=vggt_1b, backend=da3_small, ...)"
             )
-        shapes = {
-            "depth": (batch, views, height, width),
-            "cameras": (batch, views, 4, 4),
-            "frame_ids": (batch, views),
-            "depth_range": (batch, 2),
-        }
+        views = tuple(images.shape[:2])
+        shapes = {"depth": (*views, *images.shape[-2:]), "cameras": (*views, 4, 4), "frame_ids": views}
         for name in names:
             value = getattr(hints, name)
-            found = value.world_to_camera.shape if name == "cameras" else getattr(value, "shape", ())
-            if name in shapes and found != shapes[name]:
-                raise ValueError(f"hints.{name} must be {list(shapes[name])} for these images, got {list(found)}")
+            found = len(value) if name == "scene_key" else getattr(value, "world_to_camera", value).shape
+            expected = views[0] if name == "scene_key" else shapes.get(name, found)
+            if found != expected:
+                raise ValueError(f"hints.{name} must be {expected} for these images, got {found}")
         if "cameras" in names and hints.cameras is not None:
-            self._check_cameras(hints.cameras)
-        if "scene_key" in names and len(hints.scene_key) != batch:
-            raise ValueError(f"hints.scene_key must name {batch} scenes, got {len(hints.scene_key)}")
+            poses, intrinsics = hints.cameras.world_to_camera[..., :3, :], hints.cameras.intrinsics
+            finite = torch.isfinite(torch.cat((poses.flatten(-2), intrinsics.flatten(-2)), -1)).all(-1)
+            bad = ~finite | (intrinsics[..., [0, 1], [0, 1]] <= 0).any(-1)  # [B, V]
+            if bad.any():
+                scene, view = bad.nonzero()[0].tolist()
+                raise ValueError(
+                    f"hints.cameras of scene {scene}, view {view} are not finite or have no positive focal length: "
+                    "leave the view out, or correct its pose and intrinsics"
+                )
         return hints
-
-    def _check_cameras(self, cameras: Cameras) -> None:
-        """Raises ValueError for cameras that are not finite or have no positive focal length."""
-        values = torch.cat((cameras.world_to_camera[..., :3, :].flatten(-2), cameras.intrinsics.flatten(-2)), -1)
-        bad = ~torch.isfinite(values).all(-1) | (cameras.intrinsics[..., [0, 1], [0, 1]] <= 0).any(-1)  # [B, V]
-        if bad.any():
-            scene, view = bad.nonzero()[0].tolist()
-            raise ValueError(
-                f"hints.cameras of scene {scene}, view {view} are not finite or have no positive focal length: leave "
-                "the view out, or correct its pose and intrinsics"
-            )
-
-
-def _is_missing(value: object) -> bool:
-    return value is None or (isinstance(value, tuple) and not value)
 
 
 @contextmanager

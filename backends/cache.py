@@ -11,7 +11,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -64,30 +64,21 @@ class TokenCache:
 
     def _kept(self, key: str, device: torch.device, make: Callable[[], Found]) -> Found:
         path = self.folder / f"{key}.pt"
-        found = self._load(path, device)
-        if found is None:
-            found = make()
-            self._store(path, found)
-        return found
-
-    def _load(self, path: Path, device: torch.device) -> Any:
         try:
             with torch.serialization.safe_globals(_RECORDS):
                 found = torch.load(path, map_location=device, weights_only=True)
+            with suppress(OSError):  # read-only folder
+                os.utime(path)
+            return found
         except FileNotFoundError:
-            return None
+            pass
         except Exception as error:  # damaged files fail in many ways; all are fixed by writing the file again
             log.warning("cannot read %s (%s): computing it again", path, error)
-            return None
-        with suppress(OSError):  # read-only folder
-            os.utime(path)
-        return found
-
-    def _store(self, path: Path, found: object) -> None:
-        buffer = io.BytesIO()
+        found, buffer = make(), io.BytesIO()
         torch.save(found, buffer)
         write_cached(path, buffer.getvalue(), self.folder)
         self._remove_oldest()
+        return found
 
     def _remove_oldest(self) -> None:
         kept = []

@@ -58,6 +58,8 @@ def decode_pose(encoding: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor
 class NetworkBackend(Backend):
     """Base class of the VGGT and DA3 backends, whose constructors share these arguments.
 
+    They pass it ``make``, which builds the network, and :class:`Weights`; ``properties`` are those of :class:`Backend`.
+
     Args:
         name: name in checkpoints and messages.
         licence: licence of the weights.
@@ -84,16 +86,19 @@ class NetworkBackend(Backend):
     backbone_name: str  # name of the submodule that computes tokens
     camera_name = ""  # name of the submodule that decodes cameras
 
-    def _build(
+    def __init__(
         self,
         make: Callable[[], nn.Module],
         weights: Weights,
+        patch_size: int,
+        token_dim: int,
         taps: Sequence[int],
         head_chunk: int | None,
         compile: bool = False,
         freeze: bool = True,
+        **properties: bool,
     ) -> None:
-        """Builds the network with its weights and freezes it; last call of the constructor."""
+        super().__init__(weights.name, patch_size, (token_dim,) * len(taps), weights.licence, **properties)
         if list(taps) != sorted(set(taps)):
             raise ValueError(f"backend.taps={list(taps)} must be ascending: the heads expect shallow layers first")
         self.taps = tuple(taps)
@@ -116,7 +121,7 @@ class NetworkBackend(Backend):
         self.check_images(images)
         if self.needs_hints:
             hints = self.require_hints(images, hints, "cameras")
-        with self.gradients():
+        with torch.set_grad_enabled(torch.is_grad_enabled() and not self.frozen):
             return self.encode_checked(images, hints)
 
     def encode_checked(self, images: Tensor, hints: Hints | None) -> Tokens:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -121,10 +121,10 @@ class OracleBackend(Backend):
             images, depth = images.float(), hints.depth.float()
             unit = self._unit(hints, depth)
             depth = depth * unit[:, None, None, None]
-            noise = self._draw(hints, (height, width), depth)
-            cameras = self._predict_cameras(scale_translations(hints.cameras, unit), depth, noise.pose)
-            predicted = _bleed(depth * (1 + self.depth_noise * noise.relative))
-            confidence = self._predict_confidence(predicted, depth, noise)
+            relative, poses, doubt = self._draw(hints, (height, width), depth)
+            cameras = self._predict_cameras(scale_translations(hints.cameras, unit), depth, poses)
+            predicted = _bleed(depth * (1 + self.depth_noise * relative))
+            confidence = self._predict_confidence(predicted, depth, doubt)
             if self.background is not None:
                 far = self.background * depth.amax((1, 2, 3), keepdim=True)
                 predicted = torch.where(depth > 0, predicted, far)
@@ -148,67 +148,42 @@ class OracleBackend(Backend):
             depth = depth * torch.exp(self.response * residual.reshape(depth.shape))
         return Geometry(depth, tokens.state["confidence"], cameras, torch.ones_like(depth[:, 0, 0, 0]))
 
-    @torch.no_grad()
-    def predict_cameras(self, images: Tensor, hints: Hints | None = None) -> Cameras:
-        """See :meth:`Backend.predict_cameras`; computes no tokens and no depth."""
-        self.check_images(images)
-        hints = self.require_hints(images, hints, "depth", "cameras", "scene_key", "frame_ids")
-        assert hints.depth is not None
-        assert hints.cameras is not None
-        with full_precision(images):
-            unit = self._unit(hints, hints.depth.float())
-            depth = hints.depth.float() * unit[:, None, None, None]
-            poses = self._draw_parts(hints, 3, (0, 0), depth)[2]
-            return self._predict_cameras(scale_translations(hints.cameras, unit), depth, poses)
-
     def _unit(self, hints: Hints, like: Tensor) -> Tensor:
         """Scale factor ``[B]`` from ``drift``; exactly 1 if it is 0."""
         assert hints.frame_ids is not None
-        factors = []
-        for scene, frames in zip(hints.scene_key, hints.frame_ids.tolist(), strict=True):
-            key = hashlib.sha256(f"drift {self.seed}/{scene}/{frames}".encode()).digest()
-            factors.append(1 + self.drift * np.random.default_rng(int.from_bytes(key, "big")).uniform(-1, 1))
-        return like.new_tensor(factors)
+        named = zip(hints.scene_key, hints.frame_ids.tolist(), strict=True)
+        rngs = [_generator(f"drift {self.seed}/{scene}/{frames}") for scene, frames in named]
+        return like.new_tensor([1 + self.drift * rng.uniform(-1, 1) for rng in rngs])
 
-    def _draw(self, hints: Hints, size: tuple[int, int], like: Tensor) -> _Noise:
-        """Draws the noise of every view from a generator of its own."""
-        fields, constants, poses, confidences = self._draw_parts(hints, 4, size, like)
+    def _draw(self, hints: Hints, size: tuple[int, int], like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Unit noise of depth ``[B, V, H, W]``, cameras ``[B, V, 6]`` and confidence, from one generator per view."""
+        assert hints.frame_ids is not None
+        named = zip(hints.scene_key, hints.frame_ids.tolist(), strict=True)
+        rngs = [_generator(f"{self.seed}/{scene}/{frame}") for scene, frames in named for frame in frames]
+        shapes = (NOISE_GRID, (1, 1), (6,), size)
+        views = [[rng.standard_normal(shape, dtype=np.float32) for shape in shapes] for rng in rngs]
+        fields, constants, poses, doubt = (
+            torch.from_numpy(np.stack(part)).to(like).unflatten(0, like.shape[:2]) for part in zip(*views, strict=True)
+        )
         smooth = F.interpolate(fields, size, mode="bicubic", align_corners=True)
         smooth = smooth / smooth.std((-2, -1), keepdim=True)
-        return _Noise(SMOOTH_SHARE * smooth + VIEW_SHARE * constants, poses, confidences)
-
-    def _draw_parts(self, hints: Hints, count: int, size: tuple[int, int], like: Tensor) -> list[Tensor]:
-        """First ``count`` parts of the noise of all views, each ``[B, V, ...]``."""
-        assert hints.frame_ids is not None
-        views = [
-            [self._draw_view(scene, frame, size)[:count] for frame in frames]
-            for scene, frames in zip(hints.scene_key, hints.frame_ids.tolist(), strict=True)
-        ]
-        stacked = (np.stack([[view[part] for view in row] for row in views]) for part in range(count))
-        return [torch.from_numpy(part).to(like) for part in stacked]
-
-    def _draw_view(self, scene: str, frame: int, size: tuple[int, int]) -> tuple[np.ndarray, ...]:
-        key = hashlib.sha256(f"{self.seed}/{scene}/{frame}".encode()).digest()
-        rng = np.random.default_rng(int.from_bytes(key, "big"))
-        shapes = (NOISE_GRID, (1, 1), (6,), size)
-        return tuple(rng.standard_normal(shape, dtype=np.float32) for shape in shapes)
+        return SMOOTH_SHARE * smooth + VIEW_SHARE * constants, poses, doubt
 
     def _predict_cameras(self, cameras: Cameras, depth: Tensor, pose_noise: Tensor) -> Cameras:
         """Perturbs every camera but the first in its own frame; the world frame becomes that of view 0."""
-        turn = self.pose_noise * 0.5 * pose_noise[..., :3]
-        shift = self.pose_noise * pose_noise[..., 3:] * _median_depth(depth, per_view=True)[..., None]
-        half = turn / 2
+        half = self.pose_noise * 0.5 * pose_noise[..., :3] / 2
         quats = torch.cat((torch.ones_like(half[..., :1]), half), -1)  # small angles: tan(x) = x
-        error = torch.eye(4, dtype=depth.dtype, device=depth.device).repeat(*depth.shape[:2], 1, 1)
+        identity = torch.eye(4, dtype=depth.dtype, device=depth.device)
+        error = identity.repeat(*depth.shape[:2], 1, 1)
         error[..., :3, :3] = quat_to_matrix(quats)
-        error[..., :3, 3] = shift
-        error[:, 0] = torch.eye(4, dtype=depth.dtype, device=depth.device)
+        error[..., :3, 3] = self.pose_noise * pose_noise[..., 3:] * _median_depth(depth, per_view=True)[..., None]
+        error[:, 0] = identity
         exact = relative_to_first(cameras.map(Tensor.double)).map(Tensor.float)
         return Cameras(invert_rigid(error) @ exact.world_to_camera, exact.intrinsics, exact.size)
 
-    def _predict_confidence(self, predicted: Tensor, depth: Tensor, noise: _Noise) -> Tensor:
+    def _predict_confidence(self, predicted: Tensor, depth: Tensor, doubt: Tensor) -> Tensor:
         error = (predicted / depth.clamp_min(1e-6) - 1).abs()
-        confidence = 1 + 4 * torch.exp(-error / max(self.depth_noise, 0.01)) * torch.exp(0.3 * noise.confidence)
+        confidence = 1 + 4 * torch.exp(-error / max(self.depth_noise, 0.01)) * torch.exp(0.3 * doubt)
         return torch.where(depth > 0, confidence, INVALID_CONFIDENCE)
 
     def _tokens(self, images: Tensor, geometry: Tensor) -> tuple[Tensor, ...]:
@@ -222,12 +197,8 @@ class OracleBackend(Backend):
         return tuple(tokens)
 
 
-class _Noise(NamedTuple):
-    """Noise of B scenes with V views, all of unit variance."""
-
-    relative: Tensor  # [B, V, H, W]
-    pose: Tensor  # [B, V, 6]
-    confidence: Tensor  # [B, V, H, W]
+def _generator(name: str) -> np.random.Generator:
+    return np.random.default_rng(int.from_bytes(hashlib.sha256(name.encode()).digest(), "big"))
 
 
 def _median_depth(depth: Tensor, per_view: bool = False) -> Tensor:

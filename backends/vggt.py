@@ -223,8 +223,6 @@ class VGGTBackend(NetworkBackend):
         compile: bool = False,
         freeze: bool = True,
     ) -> None:
-        super().__init__(name, patch_size, (2 * dim,) * len(taps), licence)
-
         def make() -> VGGTNetwork:
             aggregator = Aggregator(dim, depth, encoder_depth, num_heads, image_size, patch_size)
             network = VGGTNetwork(aggregator, features, out_channels, camera_depth, camera_heads)
@@ -233,7 +231,7 @@ class VGGTBackend(NetworkBackend):
             return network
 
         weights = Weights(name, licence, pretrained, repo, revision, path, seed, ignorable=IGNORABLE)
-        self._build(make, weights, taps, head_chunk, compile, freeze)
+        super().__init__(make, weights, patch_size, 2 * dim, taps, head_chunk, compile, freeze)
 
     def encode_checked(self, images: Tensor, hints: Hints | None) -> Tokens:
         """See :meth:`NetworkBackend.encode_checked`."""

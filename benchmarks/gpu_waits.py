@@ -134,8 +134,6 @@ def as_on_a_gpu() -> Iterator[None]:
     """Makes a CPU run the code paths of a GPU inside the block, except Triton kernels."""
     from vg2gt.kernels import curve_codes, row_products
     from vg2gt.losses import gaussian, geometry
-    from vg2gt.losses.point_normals import point_normal_reference
-    from vg2gt.losses.structure import structure_reference
     from vg2gt.method import knn, point_features, point_mlp, sparse_conv
     from vg2gt.method.additions import point_moments, voxel_normals
 
@@ -146,9 +144,9 @@ def as_on_a_gpu() -> Iterator[None]:
     changes += [(module, "has_onednn", lambda device: False) for module in (row_products, point_mlp)]
     changes += [
         (sparse_conv, "one_by_one", lambda device: False),
-        (geometry, "point_normal_loss", point_normal_reference),
+        (geometry, "point_normal_loss", geometry.point_normal_reference),
         (geometry, "order_statistic", geometry.sorted_order_statistic),
-        (gaussian, "structure_loss", structure_reference),
+        (gaussian, "structure_loss", gaussian.structure_reference),
     ]
     with ExitStack() as stack:
         for target, name, value in changes:

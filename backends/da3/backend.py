@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import get_args
 
 import torch
 from torch import Tensor, nn
 
 from backends.da3.backbone import Backbone, PretrainedBackbone, ReferenceView
-from backends.da3.gaussians import GaussianHead
 from backends.dpt import DPT, in_chunks
 from backends.network import NetworkBackend, decode_pose, encode_pose, normalize_images, predict
 from backends.vit import FeedForward, ViTBlock, ViTMLP
@@ -165,12 +163,8 @@ class DA3Backend(NetworkBackend):
         if reference_view not in get_args(ReferenceView):
             known = ", ".join(get_args(ReferenceView))
             raise ValueError(f"backend.reference_view is {reference_view!r}; choose one of {known}")
-        super().__init__(name, patch_size, (2 * dim,) * len(taps), licence, needs_hints=given_poses)
-        self.reference_view: ReferenceView = reference_view
-        self.given_poses = given_poses
 
         def make() -> DA3Network:
-            """Builds the network without weights."""
             network = DA3Network(
                 Backbone(dim, depth, num_heads, ffn, multiview_from, image_size, patch_size),
                 CameraEncoder(dim, camera_depth, camera_heads) if given_poses else None,
@@ -178,30 +172,17 @@ class DA3Backend(NetworkBackend):
                 out_channels,
             )
             decoder = network.cam_dec  # predicts about the identity pose and fields of view of 1 rad
-            for layer, bias in (
-                (decoder.fc_t, (0, 0, 0)),
-                (decoder.fc_qvec, (0, 0, 0, 1)),
-                (decoder.fc_fov[0], (1, 1)),
-            ):
-                predict(layer, bias)
+            predict(decoder.fc_t, (0, 0, 0))
+            predict(decoder.fc_qvec, (0, 0, 0, 1))
+            predict(decoder.fc_fov[0], (1, 1))
             return network
 
         unused = (*RAY_BRANCH, "gs_head.", *(() if given_poses else ("cam_enc.",)))
         ignorable = (*(prefix + part for part in unused), *(part for part in NESTED_PARTS if part != prefix))
         weights = Weights(name, licence, pretrained, repo, revision, path, seed, prefix, ignorable)
-        self._build(make, weights, taps, head_chunk, compile, freeze)
-
-    def gaussian_head(self) -> GaussianHead:
-        """Loads DA3's own Gaussian head, frozen, from the same file.
-
-        Raises:
-            ValueError: if the file has none; only that of GIANT does.
-        """
-        weights = replace(self.weights, prefix=f"{self.weights.prefix}gs_head.", ignorable=("",))
-        try:
-            return weights.build(lambda: GaussianHead(**self.network.arguments)).requires_grad_(False)
-        except ValueError as error:
-            raise ValueError(f"backend {self.name} has no Gaussian head, da3_giant has one: {error}") from error
+        given = {"needs_hints": given_poses}
+        super().__init__(make, weights, patch_size, 2 * dim, taps, head_chunk, compile, freeze, **given)
+        self.reference_view: ReferenceView = reference_view
 
     def encode_checked(self, images: Tensor, hints: Hints | None) -> Tokens:
         """See :meth:`NetworkBackend.encode_checked`."""
@@ -209,12 +190,7 @@ class DA3Backend(NetworkBackend):
         if self.network.cam_enc is not None and hints is not None and hints.cameras is not None:
             with full_precision(images):
                 given = self.network.cam_enc(normalize_cameras(hints.cameras))
-        return self.encode_with(images, given)
-
-    def encode_with(self, images: Tensor, camera_tokens: Tensor | None) -> Tokens:
-        """Encodes checked images; ``camera_tokens [B, V, C]`` of the camera encoder replace the learned ones."""
+        backbone = self.network.backbone.pretrained
         with half_precision_on_gpu(images):
-            patch, camera = self.network.backbone.pretrained(
-                normalize_images(images), self.taps, self.reference_view, camera_tokens
-            )
+            patch, camera = backbone(normalize_images(images), self.taps, self.reference_view, given)
         return self.as_tokens(images, patch, camera)

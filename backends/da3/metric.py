@@ -67,8 +67,6 @@ class DA3MetricBackend(NetworkBackend):
         seed: int = 0,
         head_chunk: int | None = 8,
     ) -> None:
-        super().__init__(name, patch_size, (dim,) * len(taps), licence, is_metric=True, needs_hints=True)
-
         def make() -> DA3MetricNetwork:
             backbone = Backbone(dim, depth, num_heads, "mlp", None, image_size, patch_size)
             head = DPT(dim, features, out_channels, 1, patch_size, normalize=False, position_weight=0, sky=True)
@@ -76,7 +74,7 @@ class DA3MetricBackend(NetworkBackend):
 
         ignorable = tuple(part for part in NESTED_PARTS if part != prefix)
         weights = Weights(name, licence, pretrained, repo, revision, path, seed, prefix, ignorable)
-        self._build(make, weights, taps, head_chunk)
+        super().__init__(make, weights, patch_size, dim, taps, head_chunk, is_metric=True, needs_hints=True)
 
     @torch.no_grad()
     def encode(self, images: Tensor, hints: Hints | None = None) -> Tokens:

@@ -22,7 +22,7 @@ SHIPPED = Path(__file__).parent / "weights" / "sweep.safetensors"
 LICENCE = "Apache-2.0"
 _CONFIDENCE = (0.37, 400.0)  # bounds of 1 / expected relative error
 _NO_PARALLAX = (
-    "backend {name} estimates depth from parallax, but {why}: take photos from different positions, or choose a "
+    "backend sweep estimates depth from parallax, but {why}: take photos from different positions, or choose a "
     "single-image backend (backend=vggt_1b, backend=da3_small, ...)"
 )
 
@@ -76,7 +76,9 @@ class SweepBackend(Backend):
         with full_precision(images):
             for scene, pictures in enumerate(images.float()):
                 views = PosedViews(pictures, cameras.world_to_camera[scene], cameras.intrinsics[scene])
-                self._check_parallax(views)
+                if len(pictures) < self.min_views or not (camera_distances(views.world_to_camera) > 0).any():
+                    why = "got a single view" if len(pictures) == 1 else "all cameras are at the same position"
+                    raise ValueError(_NO_PARALLAX.format(why=why))
                 features = self.network.features(pictures)
                 hint = None if hints.depth_range is None else hints.depth_range[scene].float()
                 depth_range = self.network.find_range(features, views, self.sources, hint)
@@ -102,9 +104,3 @@ class SweepBackend(Backend):
             confidence = torch.exp(-log_scale).clamp(*_CONFIDENCE)
         depth, confidence = (each.unflatten(0, (scenes, views)) for each in (depth, confidence))
         return Geometry(depth, confidence, state["cameras"], torch.ones_like(depth[:, 0, 0, 0]))
-
-    def _check_parallax(self, views: PosedViews) -> None:
-        if len(views.images) < self.min_views:
-            raise ValueError(_NO_PARALLAX.format(name=self.name, why="got a single view"))
-        if not (camera_distances(views.world_to_camera) > 0).any():
-            raise ValueError(_NO_PARALLAX.format(name=self.name, why="all cameras are at the same position"))

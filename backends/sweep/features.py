@@ -46,10 +46,15 @@ class InstanceNorm(nn.Module):
         return centered * scale.to(x.dtype) + self.bias.to(x.dtype)[:, None, None]
 
 
-def conv_norm(inputs: int, outputs: int, stride: int = 1, kernel: int = 3) -> nn.Sequential:
-    """Returns convolution, instance normalisation and ReLU."""
+def conv_norm(inputs: int, outputs: int, stride: int = 1, kernel: int = 3, relu: bool = True) -> nn.Sequential:
+    """Returns convolution, instance normalisation and, with ``relu``, ReLU."""
     conv = nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2, bias=False)
-    return nn.Sequential(conv, InstanceNorm(outputs), nn.ReLU(inplace=True))
+    return nn.Sequential(conv, InstanceNorm(outputs), *([nn.ReLU(inplace=True)] if relu else []))
+
+
+def upsample(x: Tensor, like: Tensor) -> Tensor:
+    """Resizes ``[N, C, h, w]`` bilinearly to the size of another tensor."""
+    return F.interpolate(x, size=like.shape[-2:], mode="bilinear", align_corners=False)
 
 
 class ResidualBlock(nn.Module):
@@ -58,7 +63,7 @@ class ResidualBlock(nn.Module):
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.first = conv_norm(channels, channels)
-        self.second = nn.Sequential(nn.Conv2d(channels, channels, 3, 1, 1, bias=False), InstanceNorm(channels))
+        self.second = conv_norm(channels, channels, relu=False)
 
     def forward(self, x: Tensor) -> Tensor:
         """Maps ``[N, C, h, w]`` to the same shape."""
@@ -81,32 +86,20 @@ class FeaturePyramid(nn.Module):
         self.merge_half = conv_norm(32, 32)
         self.coarse = nn.Conv2d(48, MATCH_COARSE, 3, 1, 1)
         self.fine = nn.Conv2d(32, MATCH_FINE, 3, 1, 1)
-        self.context = _conv_and_norm(48, CONTEXT_COARSE)
-        self.context_fine = _conv_and_norm(32, CONTEXT_FINE)
+        # no ReLU: it can die in the first steps, and the context with it
+        self.context = conv_norm(48, CONTEXT_COARSE, relu=False)
+        self.context_fine = conv_norm(32, CONTEXT_FINE, relu=False)
 
     def forward(self, images: Tensor) -> Features:
         """Extracts features of images ``[N, 3, H, W]`` in [0, 1]; H and W multiples of 8."""
         half = self.to_half((images - 0.5) * 3)
         quarter = self.to_quarter(half)
         eighth = self.to_eighth(quarter)
-        eighth = F.relu(eighth + _upsample(self.from_sixteenth(self.to_sixteenth(eighth)), eighth))
-        quarter = self.merge(quarter + _upsample(self.from_eighth(eighth), quarter))
-        half = self.merge_half(half + _upsample(self.from_quarter(quarter), half))
-        return Features(
-            unit_groups(self.coarse(quarter)),
-            unit_groups(self.fine(half)),
-            self.context(quarter),
-            self.context_fine(half),
-        )
-
-
-def _conv_and_norm(inputs: int, outputs: int) -> nn.Sequential:
-    """Convolution and normalisation without activation: a ReLU can die in the first steps, and the context with it."""
-    return nn.Sequential(nn.Conv2d(inputs, outputs, 3, 1, 1, bias=False), InstanceNorm(outputs))
-
-
-def _upsample(x: Tensor, like: Tensor) -> Tensor:
-    return F.interpolate(x, size=like.shape[-2:], mode="bilinear", align_corners=False)
+        eighth = F.relu(eighth + upsample(self.from_sixteenth(self.to_sixteenth(eighth)), eighth))
+        quarter = self.merge(quarter + upsample(self.from_eighth(eighth), quarter))
+        half = self.merge_half(half + upsample(self.from_quarter(quarter), half))
+        matching = (unit_groups(self.coarse(quarter)), unit_groups(self.fine(half)))
+        return Features(*matching, self.context(quarter), self.context_fine(half))
 
 
 def unit_groups(x: Tensor) -> Tensor:

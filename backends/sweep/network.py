@@ -10,18 +10,10 @@ from torch.nn import functional as F
 
 from backends.sweep.correlate import SourceWarp
 from backends.sweep.features import CONTEXT_COARSE, FeaturePyramid, Features, unit_groups
-from backends.sweep.head import DepthHead
-from backends.sweep.refine import RefineNet, convex_upsample, slices
+from backends.sweep.refine import DepthHead, RefineNet, convex_upsample, slices
 from backends.sweep.tokens import PATCH, TokenNet, patch_places
 from backends.sweep.views import agreed_range, choose_sources, wide_range
-from backends.sweep.volume import (
-    PlaneSweep,
-    VolumeNet,
-    agreement,
-    expectation,
-    near_and_far,
-    to_inverse,
-)
+from backends.sweep.volume import PlaneSweep, VolumeNet, agreement, expectation, near_and_far, to_inverse
 from vg2gt.geometry.cameras import resize_intrinsics
 from vg2gt.geometry.precision import full_precision
 

@@ -1,10 +1,18 @@
-"""Small U-Net that refines the first sweep: fills in depth where matching fails (bare walls, occlusions)."""
+"""Networks that refine depth: a U-Net after the first sweep, and the depth head, differentiable in the tokens."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
+
+from backends.sweep.features import CONTEXT_COARSE, CONTEXT_FINE, upsample
+from backends.sweep.tokens import DIM, TAPS
+
+RESPONSE = 0.02  # change of log-depth per unit of the tokens' correction channels
+CELLS = 2  # the correction channels hold CELLS x CELLS values per patch
+_SPREAD = 48  # channels per cell after the tokens are spread over the cells
+_UNSURE = -2.5  # log-scale of the relative error before training
 
 
 def activate(x: Tensor) -> Tensor:
@@ -28,11 +36,14 @@ class PlainBlock(nn.Module):
 
 
 class RefineNet(nn.Module):
-    """U-Net at 1/4, 1/8 and 1/16 of the image with the given ``channels``; its outputs are zero before training."""
+    """U-Net at 1/4, 1/8 and 1/16 of the image that fills in depth where matching fails (bare walls, occlusions).
 
-    def __init__(self, inputs: int, outputs: int, channels: tuple[int, int, int] = (64, 96, 128)) -> None:
+    Its outputs are zero before training.
+    """
+
+    def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()
-        fine, middle, coarse = channels
+        fine, middle, coarse = 64, 96, 128
         self.begin = nn.Sequential(nn.Conv2d(inputs, fine, 3, 1, 1), PlainBlock(fine))
         self.down = nn.Sequential(nn.Conv2d(fine, middle, 3, 2, 1), PlainBlock(middle))
         self.bottom = nn.Sequential(nn.Conv2d(middle, coarse, 3, 2, 1), PlainBlock(coarse), PlainBlock(coarse))
@@ -48,24 +59,15 @@ class RefineNet(nn.Module):
         """Maps ``[N, inputs, h, w]`` to ``[N, outputs, h, w]`` in float32."""
         fine = self.begin(x)
         middle = self.down(activate(fine))
-        middle = self.merge(middle + _upsample(self.up(self.bottom(activate(middle))), middle))
-        fine = self.merge_fine(fine + _upsample(self.up_fine(middle), fine))
+        middle = self.merge(middle + upsample(self.up(self.bottom(activate(middle))), middle))
+        fine = self.merge_fine(fine + upsample(self.up_fine(middle), fine))
         return self.end(activate(fine)).float()
 
 
-def _upsample(x: Tensor, like: Tensor) -> Tensor:
-    return F.interpolate(x, size=like.shape[-2:], mode="bilinear", align_corners=False)
-
-
 def convex_upsample(x: Tensor, mask: Tensor) -> Tensor:
-    """Upsamples by two, each new pixel a convex combination of 3x3 neighbours (RAFT).
+    """Upsamples ``[V, C, h, w]`` by two, each new pixel a convex combination of 3x3 neighbours (RAFT).
 
-    Args:
-        x: ``[V, C, h, w]``.
-        mask: logits of the weights ``[V, 36, h, w]``, 9 neighbours times 4 new pixels.
-
-    Returns:
-        ``[V, C, 2 h, 2 w]``.
+    ``mask`` holds the logits of the weights ``[V, 36, h, w]``: 9 neighbours times 4 new pixels.
     """
     views, channels, height, width = x.shape
     weights = mask.unflatten(1, (9, 4)).softmax(1)  # [V, 9, 4, h, w]
@@ -78,3 +80,50 @@ def slices(probability: Tensor, bins: int) -> Tensor:
     flat = probability.flatten(2).transpose(1, 2)  # [V, h w, D]
     pooled = F.adaptive_avg_pool1d(flat, bins) * (probability.shape[1] / bins)
     return torch.unflatten(pooled.transpose(1, 2), 2, probability.shape[-2:])
+
+
+class DepthHead(nn.Module):
+    """Predicts log-depth as that of the sweep plus two corrections.
+
+    The first correction is linear: the first four channels of the last tap, one per 2x2 cell of the patch, times
+    ``RESPONSE``. It makes depth change smoothly with the tokens. The second is predicted from all taps by convolutions.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.norms = nn.ModuleList(nn.LayerNorm(DIM) for _ in range(TAPS))
+        self.spread = nn.Linear(TAPS * DIM, CELLS**2 * _SPREAD)
+        self.coarse = nn.Sequential(nn.Conv2d(_SPREAD + CONTEXT_COARSE, 64, 3, 1, 1), PlainBlock(64), PlainBlock(64))
+        self.lift = nn.Conv2d(64, 48, 1)
+        self.fine = nn.Sequential(nn.Conv2d(48 + CONTEXT_FINE + 2, 48, 3, 1, 1), PlainBlock(48))
+        self.out = nn.Conv2d(48, 2, 3, 1, 1)
+        self.mask = nn.Sequential(nn.Conv2d(48, 64, 1), nn.ReLU(), nn.Conv2d(64, 9 * 4, 1))
+        nn.init.zeros_(self.out.weight)
+        nn.init.zeros_(self.out.bias)  # type: ignore[arg-type]
+
+    def forward(
+        self, taps: tuple[Tensor, ...], grid: tuple[int, int], context: Tensor, context_fine: Tensor, swept: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Decodes log-depth and the log-scale of its error, each ``[V, 4 h, 4 w]``.
+
+        Args:
+            taps: tokens ``[V, P, DIM]`` of each tap.
+            grid: patches per axis.
+            context: ``[V, CONTEXT_COARSE, h, w]``, at 1/4 of the image.
+            context_fine: ``[V, CONTEXT_FINE, 2 h, 2 w]``.
+            swept: log-depth of the sweep and its probability, ``[V, 2, 2 h, 2 w]``.
+        """
+        # tokens to cells of half a patch: [V, P, DIM] to [V, C, h, w]
+        said = torch.cat([norm(tap) for norm, tap in zip(self.norms, taps, strict=True)], -1)
+        said = F.pixel_shuffle(self.spread(said).mT.unflatten(-1, grid), CELLS)  # [V, C, h, w]
+        correction = F.pixel_shuffle(taps[-1][..., : CELLS**2].mT.unflatten(-1, grid), CELLS)
+        x = self.lift(activate(self.coarse(torch.cat((said, context), 1))))
+        # to the sweep's resolution: [V, ., 2 h, 2 w]
+        x, correction = (upsample(each, swept) for each in (x, correction))
+        center = swept[:, :1].mean((-1, -2), keepdim=True)
+        x = activate(self.fine(torch.cat((x, context_fine, swept[:, :1] - center, swept[:, 1:]), 1)))
+        log_depth, log_scale = self.out(x).float().chunk(2, 1)
+        log_depth = swept[:, :1] + RESPONSE * correction.float() + 0.25 * log_depth
+        both = torch.cat((log_depth, log_scale + _UNSURE), 1)
+        full = convex_upsample(both, self.mask(x).float())
+        return full[:, 0], full[:, 1]

@@ -9,10 +9,8 @@ from vg2gt.geometry.cameras import pixel_grid, resize_intrinsics
 
 _GRID = (5, 9)  # rays per view for measuring overlap
 _DEPTHS = 5  # planes between near and far for measuring overlap
-_LEAST_PARALLAX, _MOST_PARALLAX = (
-    0.08,
-    0.5,
-)  # baseline over depth: too little parallax below the first, too different views above the second
+# baseline over depth: too little parallax below the first, too different views above the second
+_LEAST_PARALLAX, _MOST_PARALLAX = 0.08, 0.5
 _SEEN_AGAIN = 0.4  # factor on a point's score for every source that already sees it
 _WIDE = (0.1, 40.0)  # range of the first sweep, in units of the largest distance between cameras
 _NEAREST = 0.03  # minimum near of the first sweep, in the same unit

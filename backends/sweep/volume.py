@@ -7,15 +7,16 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from backends.sweep.correlate import BEHIND, GROUPS, SourceWarp, correlate
+from backends.sweep.features import upsample
 
 _WINDOW = 2  # planes on either side of the most likely one to average over
 _AGREEMENT_WIDTH = 0.03  # relative depth difference at which agreement falls to 1/e
 
 
 def near_and_far(depth_range: Tensor) -> tuple[Tensor, Tensor]:
-    """Splits a depth range into near and far: scalars for ``[2]``, ``[V, 1, 1, 1]`` for ``[V, 2]``."""
-    near, far = depth_range.unbind(-1)
-    return (near, far) if near.dim() == 0 else (near.view(-1, 1, 1, 1), far.view(-1, 1, 1, 1))
+    """Splits a depth range ``[2]`` or ``[V, 2]`` into near and far, each ``[1 or V, 1, 1, 1]``."""
+    near, far = depth_range.view(-1, 2, 1, 1, 1).unbind(1)
+    return near, far
 
 
 def to_inverse(t: Tensor, depth_range: Tensor) -> Tensor:
@@ -60,13 +61,6 @@ class PlaneSweep(nn.Module):
         return volume.reshape(views * planes, *size, GROUPS + 1).permute(0, 3, 1, 2)
 
 
-def to_planes(volume: Tensor, size: tuple[int, int]) -> Tensor:
-    """Reshapes a volume ``[V, C, D, h w]`` to one image per plane ``[V D, C, h, w]``, channels-last."""
-    views, channels, planes, _ = volume.shape
-    images = volume.permute(0, 2, 3, 1).reshape(views * planes, *size, channels)  # [V D, h, w, C]
-    return images.permute(0, 3, 1, 2)
-
-
 class PlaneBlock(nn.Module):
     """Residual block on a volume: 3x3 in the image, then 5 along the planes, as 2D convolutions (3D ones are slow)."""
 
@@ -77,26 +71,25 @@ class PlaneBlock(nn.Module):
 
     def forward(self, x: Tensor, planes: int) -> Tensor:
         """Maps plane images ``[V D, C, h, w]``, channels-last, to the same shape."""
-        size = x.shape[-2:]
         y = F.relu(self.image(x), inplace=True).permute(0, 2, 3, 1)  # [V D, h, w, C]
-        y = y.reshape(-1, planes, size[0] * size[1], y.shape[-1]).permute(0, 3, 1, 2)  # [V, C, D, h w]
-        return x + to_planes(
-            self.planes(y), (size[0], size[1])
-        )  # not in place: on a view, the gradients would lose channels-last
+        images = y.shape
+        y = y.reshape(-1, planes, images[1] * images[2], images[3]).permute(0, 3, 1, 2)  # [V, C, D, h w]
+        change = self.planes(y).permute(0, 2, 3, 1).reshape(images).permute(0, 3, 1, 2)  # [V D, C, h, w]
+        return x + change  # not in place: on a view, the gradients would lose channels-last
 
 
 class VolumeNet(nn.Module):
-    """Light 2.5D regularisation of a volume to one logit per plane; ``channels`` at full and half resolution."""
+    """Light 2.5D regularisation of a volume to one logit per plane, at full and half resolution."""
 
-    def __init__(self, channels: tuple[int, int] = (16, 32)) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.begin = nn.Conv2d(GROUPS + 1, channels[0], 3, 1, 1)
-        self.first = PlaneBlock(channels[0])
-        self.down = nn.Conv2d(channels[0], channels[1], 2, 2)
-        self.coarse = nn.ModuleList(PlaneBlock(channels[1]) for _ in range(2))
-        self.up = nn.Conv2d(channels[1], channels[0], 1)
-        self.last = PlaneBlock(channels[0])
-        self.end = nn.Conv2d(channels[0], 1, 1)
+        self.begin = nn.Conv2d(GROUPS + 1, 16, 3, 1, 1)
+        self.first = PlaneBlock(16)
+        self.down = nn.Conv2d(16, 32, 2, 2)
+        self.coarse = nn.ModuleList(PlaneBlock(32) for _ in range(2))
+        self.up = nn.Conv2d(32, 16, 1)
+        self.last = PlaneBlock(16)
+        self.end = nn.Conv2d(16, 1, 1)
         self.sharpness = nn.Parameter(torch.tensor(6.0))  # adds the similarity to the logits, also before training
 
     def forward(self, volume: Tensor, planes: int) -> Tensor:
@@ -105,8 +98,7 @@ class VolumeNet(nn.Module):
         y = F.relu(self.down(x), inplace=True)
         for block in self.coarse:
             y = F.relu(block(y, planes), inplace=True)
-        up = F.interpolate(self.up(y), size=x.shape[-2:], mode="bilinear", align_corners=False)
-        x = F.relu(up.add_(x), inplace=True)
+        x = F.relu(upsample(self.up(y), x).add_(x), inplace=True)
         similarity = volume.permute(0, 2, 3, 1)[..., :GROUPS].mean(-1)  # [V D, h, w]
         logits = 4 * self.end(self.last(x, planes)).float() + self.sharpness * similarity[:, None]
         return logits.view(-1, planes, *volume.shape[-2:])
@@ -147,10 +139,8 @@ def agreement(inverse: Tensor, warp: SourceWarp) -> Tensor:
     agreements, differences = [], []
     for source in range(warp.sources.shape[1]):
         grid, inside, z = warp(source, inverse.flatten(2))
-        there = F.grid_sample(inverse[warp.sources[:, source]], grid, padding_mode="border", align_corners=False)[
-            :, :, 0
-        ]  # [V, 1, h w]
-        difference = there * (z / inverse.flatten(2)).clamp_min(BEHIND) - 1
+        there = F.grid_sample(inverse[warp.sources[:, source]], grid, padding_mode="border", align_corners=False)
+        difference = there[:, :, 0] * (z / inverse.flatten(2)).clamp_min(BEHIND) - 1
         agreements.append(torch.exp(-difference.abs() / _AGREEMENT_WIDTH) * inside)
         differences.append(difference.clamp(-0.3, 0.3) * inside)
     every = torch.stack(agreements)  # [n, V, 1, h w]

@@ -8,6 +8,7 @@ from backends.da3 import DA3NestedBackend
 from backends.da3.backend import RAY_BRANCH
 from backends.weights import load_strictly
 from tests.references import read_json
+from vg2gt.baselines.da3_gaussians import GaussianHead
 
 CASES = {
     "vggt_1b": ("vggt-1b", ()),
@@ -53,7 +54,7 @@ def test_a_published_file_would_load(make_backend, load_config, name: str) -> No
 
 def test_names_and_shapes_of_the_gaussian_head(make_backend) -> None:
     with torch.device("meta"):
-        head = make_backend("da3_giant", "pretrained=false").gaussian_head()
+        head = GaussianHead(**make_backend("da3_giant", "pretrained=false").network.arguments)
     prefix = "model.gs_head."
     published = read_json("manifests")["da3-giant"]["tensors"]
     assert tensors(head, prefix) == {key: shape for key, shape in published.items() if key.startswith(prefix)}

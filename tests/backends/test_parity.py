@@ -13,6 +13,7 @@ from torch import Tensor
 
 from backends.da3 import DA3Backend, DA3MetricBackend
 from backends.da3.metric import fill_sky
+from backends.network import normalize_images
 from backends.vggt import VGGTBackend
 from tests.references import draw_weights, read_cases, read_json
 from vg2gt.baselines import DA3Gaussians
@@ -118,13 +119,14 @@ def test_multi_view(weights: Callable[[str], str], network: str, case: int) -> N
     reference = Reference(network, case)
     config, folder, images = reference.config, weights(network), reference.images
     backend = vggt(config, folder) if network == "vggt_tiny" else da3(config, reference.case, folder)
-    if isinstance(backend, DA3Backend) and backend.given_poses:
+    if isinstance(backend, DA3Backend) and backend.needs_hints:
         # The reference fed these cameras as they are; encode() would first normalise them.
         size = (images.shape[-2], images.shape[-1])
         cameras = Cameras(reference.tensors["in_extrinsics_w2c"], reference.tensors["in_intrinsics"], size)
         given = backend.network.cam_enc(cameras)
         reference.check("given", given)
-        tokens = backend.encode_with(images, given)
+        backbone, normalised = backend.network.backbone.pretrained, normalize_images(images)
+        tokens = backend.as_tokens(images, *backbone(normalised, backend.taps, backend.reference_view, given))
     else:
         tokens = backend.encode(images)
     reference.check_tokens(tokens)

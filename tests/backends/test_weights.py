@@ -1,5 +1,6 @@
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -8,7 +9,7 @@ from hydra.errors import InstantiationException
 from safetensors.torch import save_file
 from torch import nn
 
-from backends.weights import find_weights, load_strictly
+from backends.weights import Weights, load_strictly
 
 
 def published(backend, prefix: str = "model.") -> dict[str, torch.Tensor]:
@@ -77,13 +78,14 @@ def test_options_that_mean_nothing_are_refused(make_backend, options: dict[str, 
 
 
 def test_missing_files_and_a_missing_hub_library_are_named(tmp_path: Path, monkeypatch) -> None:
+    weights = Weights("name", "licence", True, "some/repo", None, str(tmp_path), 0)
     with pytest.raises(FileNotFoundError, match=r"model\.safetensors.*backend\.pretrained=false.*some/repo"):
-        find_weights("name", "some/repo", None, str(tmp_path))
+        weights.find()
     with pytest.raises(FileNotFoundError, match="no published weights"):
-        find_weights("name", None, None, None)
+        replace(weights, repo=None, path=None).find()
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
     with pytest.raises(ImportError, match=r"pip install 'vg2gt\[hub\]'"):
-        find_weights("name", "some/repo", None, None)
+        replace(weights, path=None).find()
 
 
 def test_the_hub_gives_weights_or_says_in_one_line_why_not(monkeypatch, tmp_path, make_backend, donor) -> None:
@@ -94,7 +96,7 @@ def test_the_hub_gives_weights_or_says_in_one_line_why_not(monkeypatch, tmp_path
     def download(repo: str, file: str, revision: str | None = None) -> str:
         asked.append((repo, file, revision))
         if revision == "v2":
-            raise FileNotFoundError("not in the cache") from ConnectionError("refused\nby 127.0.0.1")
+            raise FileNotFoundError("not in\nthe cache.")
         return str(tmp_path / file)
 
     monkeypatch.setattr(hub, "hf_hub_download", download)
@@ -103,7 +105,5 @@ def test_the_hub_gives_weights_or_says_in_one_line_why_not(monkeypatch, tmp_path
     with pytest.raises(InstantiationException) as caught:
         make_backend(*options, "revision=v2")
     assert asked == [("someone/da3", "model.safetensors", revision) for revision in (None, "v2")]
-    said = (
-        r"cannot get model\.safetensors of someone/da3 \(revision v2\) .*: not in the cache; refused by 127\.0\.0\.1\. "
-    )
+    said = r"cannot get model\.safetensors of someone/da3 \(revision v2\) .*: not in the cache\. "
     assert re.match(said + r"Check .*backend\.path=.*backend\.pretrained=false", str(caught.value.__cause__))

@@ -14,10 +14,11 @@ from vg2gt.losses.geometry import (
     camera_errors,
     depth_gradient_loss,
     order_statistic,
+    point_normal_loss,
+    point_normal_reference,
     sorted_order_statistic,
     trusted_pixels,
 )
-from vg2gt.losses.point_normals import point_normal_loss, point_normal_reference
 from vg2gt.losses.truth import normalize_truth
 from vg2gt.types import Cameras
 

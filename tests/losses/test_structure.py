@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from vg2gt.losses.structure import structure_loss, structure_reference
+from vg2gt.losses.gaussian import structure_loss, structure_reference
 
 
 def pictures(height: int, width: int) -> tuple[Tensor, Tensor]:

@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from backends.vggt import VGGTBackend
-from backends.weights import find_weights
 from tests.data.sources.layout_rgbd import write_recording
 from tests.safety.conftest import Armed
 from vg2gt.data import DataError, RGBDFolder
@@ -85,7 +84,7 @@ def test_weights(tmp_path: Path, armed: Armed, kind: str, suffix: str) -> None:
     path = tmp_path / f"model{suffix}"
     path.write_bytes(PICKLES[kind](armed))
     for read in (
-        lambda: read_tensors(find_weights("vggt", None, None, str(path))),
+        lambda: read_tensors(path),
         lambda: VGGTBackend(pretrained=True, path=str(path)),
         *([lambda: load_lpips(str(path))] if suffix != ".pt" else []),
     ):

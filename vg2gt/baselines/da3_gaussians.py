@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 from backends.base import Backend
 from backends.da3 import DA3Backend
-from backends.da3.gaussians import PARTS, SH_DEGREE
+from backends.dpt import DPT
+from backends.network import normalize_images
 from vg2gt.baselines.pixels import SMALLEST_FOOTPRINT, Pixels, harmonic_gains, usable_pixels
+from vg2gt.geometry.precision import full_precision
 from vg2gt.geometry.rotations import matrix_to_quat, multiply_quats
 from vg2gt.method.additions.visibility import ViewCheck
 from vg2gt.model import Background, Reconstructor, SceneScale
@@ -20,6 +23,36 @@ from vg2gt.types import Cameras, Gaussians, Geometry, Hints, Prediction, Tokens
 
 MIN_SCALE, MAX_SCALE = 1e-5, 30.0  # in SCALE_UNIT times the sum of a pixel's sides
 SCALE_UNIT = 0.1
+SH_DEGREE = 2
+PARTS = (2, 3, 4, 3 * (SH_DEGREE + 1) ** 2, 1, 1)
+
+
+class GaussianHead(DPT):
+    """A DPT that adds image features to its fused map; names, shapes and arguments as published (``gs_head``)."""
+
+    def __init__(self, token_dim: int, features: int, out_channels: Sequence[int], patch_size: int) -> None:
+        super().__init__(token_dim, features, out_channels, sum(PARTS), patch_size, normalize=False)
+        width = features // 2
+        layers: list[nn.Module] = []
+        for inside, outside in ((3, width // 4), (width // 4, width // 2), (width // 2, width)):
+            layers += [nn.Conv2d(inside, outside, 3, padding=1), nn.GELU()]
+        self.images_merger = nn.Sequential(*layers)
+
+    @torch.no_grad()
+    def predict(self, tokens: Tokens, images: Tensor, chunk: int | None) -> Tensor:
+        """Predicts raw Gaussians ``[B, V, H, W, sum(PARTS)]`` of images, at most ``chunk`` views (None: all) at a time.
+
+        Per pixel: offset in pixels, logits of the scales, quaternion (xyzw, in camera axes), SH coefficients (channel
+        by channel, in camera axes), depth offset, logit of the opacity.
+        """
+        taps = [tap.flatten(0, 1) for tap in tokens.patch]
+        with full_precision(images):
+            parts = []
+            for views in torch.arange(len(taps[0]), device=images.device).split(chunk or len(taps[0])):
+                fused = self.fuse([tap[views] for tap in taps], tokens.grid)
+                merged = fused + self.images_merger(normalize_images(images).flatten(0, 1)[views])
+                parts.append(self.scratch.get_submodule("output_conv2")(merged))
+        return torch.cat(parts).unflatten(0, images.shape[:2]).permute(0, 1, 3, 4, 2)
 
 
 class DA3Gaussians(Reconstructor):
@@ -50,7 +83,12 @@ class DA3Gaussians(Reconstructor):
         if not isinstance(backend, DA3Backend):
             raise ValueError(f"model=da3_gs requires backend=da3_giant, got {backend.name}")
         super().__init__(backend, scale, background, visibility)
-        self.head = backend.gaussian_head()
+        # from the same file as the backbone; only that of GIANT has one
+        weights = replace(backend.weights, prefix=f"{backend.weights.prefix}gs_head.", ignorable=("",))
+        try:
+            self.head = weights.build(lambda: GaussianHead(**backend.network.arguments)).requires_grad_(False)
+        except ValueError as error:
+            raise ValueError(f"backend {backend.name} has no Gaussian head, da3_giant has one: {error}") from error
 
     def run_backbone(self, images: Tensor, hints: Hints | None) -> tuple[Tokens, Geometry]:
         """See :meth:`vg2gt.model.Reconstructor.run_backbone`."""
@@ -84,7 +122,7 @@ def place(raw: Tensor, pixels: Pixels, unit: Tensor, own: Tensor, frame: Tensor)
     """Converts raw head outputs to Gaussians of the scene.
 
     Args:
-        raw: ``[N, sum(PARTS)]``, see :meth:`backends.da3.gaussians.GaussianHead.predict`.
+        raw: ``[N, sum(PARTS)]``, see :meth:`GaussianHead.predict`.
         pixels: the same N pixels.
         unit: ``[B]`` scene units per unit of the network.
         own: ``[B * V, 4]`` camera-to-world quaternions predicted by the network.

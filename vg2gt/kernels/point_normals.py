@@ -1,4 +1,4 @@
-"""The surface normal loss and its gradient in one compiled pass (:mod:`vg2gt.losses.point_normals`)."""
+"""The surface normal loss and its gradient in one compiled pass (:mod:`vg2gt.losses.geometry`)."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def _disagreement(view, depth, true, valid, pinholes, true_pinholes, turn, strid
 def _row(table, columns, v, w, sx, sy, tx, ty, r):
     """Returns ``sum 1 - cos`` over a row's corners; writes their derivatives into the table's last five lines.
 
-    The normals are those of ``vg2gt.losses.point_normals._corner_normals``: x, y, z predicted, ex, ey, ez true.
+    The normals are those of ``vg2gt.losses.geometry._corner_normals``: x, y, z predicted, ex, ey, ez true.
     """
     total = ZERO
     for k in range(1, columns + 1):

@@ -1,4 +1,4 @@
-"""``1 - SSIM`` and its gradient in one compiled pass (:func:`vg2gt.losses.structure.structure_loss`)."""
+"""``1 - SSIM`` and its gradient in one compiled pass (:func:`vg2gt.losses.gaussian.structure_loss`)."""
 
 from __future__ import annotations
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from kornia.metrics import ssim
 from torch import Tensor
 
 from vg2gt.geometry.normals import normals_from_depth
-from vg2gt.losses.structure import structure_loss
+from vg2gt.kernels.structure import HALF, WINDOW, Structure
 from vg2gt.types import Cameras, Render, TensorRecord
 
 NORMAL_TARGETS = ("render", "decoded", "gt")
@@ -115,14 +116,14 @@ class GaussianLoss:
     def _normal(
         self, rendered: Render, cameras: Cameras, targets: RenderTargets, hits: Tensor, trust: Tensor
     ) -> Tensor:
+        weights, intrinsics = torch.ones_like(trust), cameras.intrinsics[0]
         if self.normal_target == "render":
-            expected, valid = normals_from_depth(torch.where(hits, rendered.depth[0], 0.0), cameras.intrinsics[0])
+            depth = torch.where(hits, rendered.depth[0], 0.0)
         elif self.normal_target == "decoded":
-            decoded = torch.where(targets.decoded_valid, targets.decoded.detach(), 0.0)
-            expected, valid = normals_from_depth(decoded, cameras.intrinsics[0])
+            depth, weights = torch.where(targets.decoded_valid, targets.decoded.detach(), 0.0), trust
         else:
-            expected, valid = normals_from_depth(torch.where(targets.valid, targets.depth, 0.0), targets.intrinsics)
-        weights = trust if self.normal_target == "decoded" else torch.ones_like(trust)
+            depth, intrinsics = torch.where(targets.valid, targets.depth, 0.0), targets.intrinsics
+        expected, valid = normals_from_depth(depth, intrinsics)
         return normal_error(rendered.normal[0], expected, weights, hits & valid)
 
 
@@ -142,3 +143,24 @@ def weighted_mean(values: Tensor, weights: Tensor, mask: Tensor) -> Tensor:
     """Returns the weighted mean of the masked values; a zero with gradient if the mask is empty."""
     weights = torch.where(mask, weights, 0.0)
     return (torch.where(mask, values, 0.0) * weights).sum() / weights.sum().clamp(min=torch.finfo(weights.dtype).tiny)
+
+
+def structure_loss(images: Tensor, reference: Tensor) -> Tensor:
+    """Returns the mean of ``1 - SSIM`` (paper, eqn gsloss): 11 x 11 Gaussian window, sigma 1.5, reflected borders.
+
+    Args:
+        images: ``[R, C, H, W]``, at least 6 pixels high and wide.
+        reference: ``[R, C, H, W]``, of the same dtype.
+
+    Returns:
+        A scalar, differentiable in the images. Compiled if both are float32 on a CPU and the reference has no gradient.
+    """
+    on_cpu = all(tensor.device.type == "cpu" and tensor.dtype == torch.float32 for tensor in (images, reference))
+    if on_cpu and not reference.requires_grad and min(images.shape[-2:]) > HALF:
+        return Structure.apply(images, reference)  # pyright: ignore[reportReturnType]
+    return structure_reference(images, reference)
+
+
+def structure_reference(images: Tensor, reference: Tensor) -> Tensor:
+    """:func:`structure_loss` with kornia, for any device; also differentiable in the reference."""
+    return (1 - ssim(images, reference, WINDOW)).mean()

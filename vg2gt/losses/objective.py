@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -13,6 +14,7 @@ from vg2gt.losses.geometry import GeometryLoss, TaskLoss, camera_errors
 from vg2gt.losses.truth import ScaleAlignment, Truth, normalize_truth, to_unit
 from vg2gt.types import Batch, Cameras, Decoded, Geometry, Render, TensorRecord
 
+Record = TypeVar("Record", bound=TensorRecord)
 FORMS = ("improve", "paper_literal")
 COMPARED = ("total", "reg")
 
@@ -74,30 +76,6 @@ class LossReport:
     skipped: Tensor
 
 
-@dataclass(frozen=True)
-class SceneLoss:
-    """One scene's weighted sum and unweighted terms, with gradient."""
-
-    total: Tensor
-    terms: dict[str, Tensor]
-
-    def __add__(self, other: SceneLoss) -> SceneLoss:
-        return SceneLoss(self.total + other.total, self.terms | other.terms)
-
-
-@dataclass(frozen=True)
-class RenderedViews(TensorRecord):
-    """Renders of R views of the batch with ``cameras``; ``views [R]`` int64 are their indices in the batch."""
-
-    render: Render
-    cameras: Cameras
-    views: Tensor
-
-    def scene(self, index: int) -> tuple[Render, Cameras]:
-        """Returns one scene's renders and cameras (B = 1)."""
-        return self.render.map(lambda tensor: tensor[index : index + 1]), self.cameras.scene(index)
-
-
 class VG2GTLoss(nn.Module):
     """Training objective of VG²GT.
 
@@ -147,16 +125,17 @@ class VG2GTLoss(nn.Module):
         Raises:
             ValueError: if geometry, renders, views and cameras do not match.
         """
-        shown = _checked(prediction, batch, rendered, views, render_cameras)
+        _check_shapes(prediction, batch, rendered, views, render_cameras)
         with torch.autocast(batch.images.device.type, enabled=False):
             # one scale per scene from the prediction to the ground truth's unit: [B]
             truth = normalize_truth(batch.map(_full_precision))
             initial, enhanced = (g.map(_full_precision) for g in (prediction.initial, prediction.geometry))
             initial_scale = self.align.fit(initial, truth)
             scale = initial_scale if self.align.source == "initial" else self.align.fit(enhanced, truth)
-            if shown is not None:
-                hits = self.gaussian.hits(shown.render)
-                scale = self.align.fit_rendered(shown.render.depth, hits, shown.views, truth, scale)
+            if rendered is not None and views is not None and render_cameras is not None:
+                rendered, cameras = rendered.map(_full_precision), render_cameras.map(_full_precision)
+                views = views.to(rendered.color.device)
+                scale = self.align.fit_rendered(rendered.depth, self.gaussian.hits(rendered), views, truth, scale)
             # geometry and enhancement losses of the context views
             context = truth.views(slice(0, batch.num_context))
             valid = context.valid & (initial.depth > 0) & (enhanced.depth > 0)
@@ -166,42 +145,39 @@ class VG2GTLoss(nn.Module):
                 for i in range(len(batch.scene))
             ]
             # losses of the R rendered views
-            if shown is not None:
-                targets = _render_targets(batch, after, truth, shown.views)
-                scenes = [
-                    scene + self._gaussian_terms(*shown.scene(i), targets.scene(i), scale[i])
-                    for i, scene in enumerate(scenes)
-                ]
+            if rendered is not None and views is not None:
+                targets = _render_targets(batch, after, truth, views)
+                for i, (total, terms) in enumerate(scenes):
+                    shown = _one(rendered, i)
+                    found = self.gaussian(shown, cameras.scene(i), targets.scene(i), scale[i])
+                    share = self.gaussian.hits(shown).to(scale.dtype).mean()
+                    scenes[i] = (total + self.gaussian.total(found), terms | found | {"rendered": share})
             # means over scenes
-            total = torch.stack([scene.total for scene in scenes]).mean()
-            terms = {name: torch.stack([s.terms[name].detach() for s in scenes]).mean() for name in scenes[0].terms}
-        return LossReport(total, terms, scale, (~truth.known).sum())
+            total = torch.stack([total for total, _ in scenes]).mean()
+            means = {name: torch.stack([terms[name].detach() for _, terms in scenes]).mean() for name in scenes[0][1]}
+        return LossReport(total, means, scale, (~truth.known).sum())
 
-    def _geometry_terms(self, before: Geometry, after: Geometry, truth: Truth, valid: Tensor) -> SceneLoss:
-        """Returns the geometry and enhancement losses of one scene, all in the truth's unit."""
+    def _geometry_terms(
+        self, before: Geometry, after: Geometry, truth: Truth, valid: Tensor
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Weighted sum and terms of the geometry and enhancement losses of one scene, all in the truth's unit."""
         with torch.no_grad():
             depth_before, point_before = self.geometry(before.depth, before.depth_conf, before.cameras, truth, valid)
         depth, point = self.geometry(after.depth, after.depth_conf, after.cameras, truth, valid)
         hinge_depth, hinge_point = self.enhance(depth_before, depth), self.enhance(point_before, point)
         total = self.geometry.depth * depth.total + self.geometry.point * point.total
-        terms = {f"depth_{part}": getattr(depth, part) for part in ("conf", "reg", "grad")}
-        terms |= {f"point_{part}": getattr(point, part) for part in ("conf", "reg", "grad")}
+        terms = {f"depth_{part}": value for part, value in vars(depth).items()}
+        terms |= {f"point_{part}": value for part, value in vars(point).items()}
         terms |= {"enhance_depth": hinge_depth, "enhance_point": hinge_point}
         terms |= {"initial_depth": self.enhance.compared(depth_before)}
         terms |= {"initial_point": self.enhance.compared(point_before)}
         terms |= camera_errors(after.cameras, truth.cameras)
-        return SceneLoss(total + self.enhance.weight * (hinge_depth + hinge_point), terms)
-
-    def _gaussian_terms(self, render: Render, cameras: Cameras, targets: RenderTargets, scale: Tensor) -> SceneLoss:
-        """Returns the losses of one scene's rendered views."""
-        terms = self.gaussian(render, cameras, targets, scale)
-        share = self.gaussian.hits(render).to(scale.dtype).mean()
-        return SceneLoss(self.gaussian.total(terms), terms | {"rendered": share})
+        return total + self.enhance.weight * (hinge_depth + hinge_point), terms
 
 
-def _one(geometry: Geometry, index: int) -> Geometry:
-    """Returns one scene's geometry (B = 1)."""
-    return geometry.map(lambda tensor: tensor[index : index + 1])
+def _one(record: Record, scene: int) -> Record:
+    """One scene of a record of B scenes (B = 1)."""
+    return record.map(lambda tensor: tensor[scene : scene + 1])
 
 
 def _render_targets(batch: Batch, geometry: Geometry, truth: Truth, views: Tensor) -> RenderTargets:
@@ -228,10 +204,9 @@ def _full_precision(tensor: Tensor) -> Tensor:
     return tensor.float() if tensor.dtype in (torch.float16, torch.bfloat16) else tensor
 
 
-def _checked(
+def _check_shapes(
     prediction: Decoded, batch: Batch, rendered: Render | None, views: Tensor | None, cameras: Cameras | None
-) -> RenderedViews | None:
-    """Checks that all inputs match; returns the rendered views in full precision, if there are any."""
+) -> None:
     expected = (len(batch.scene), batch.num_context, *batch.images.shape[-2:])
     for name, geometry in (("initial", prediction.initial), ("geometry", prediction.geometry)):
         if tuple(geometry.depth.shape) != expected:
@@ -240,7 +215,7 @@ def _checked(
                 f"{expected}: pass the prediction made from batch.context"
             )
     if rendered is None:
-        return None
+        return
     if views is None or cameras is None:
         raise ValueError("rendered= requires views= (indices of the rendered views in the batch) and render_cameras=")
     found = (tuple(rendered.color.shape[:2]), tuple(cameras.world_to_camera.shape[:2]))
@@ -249,4 +224,3 @@ def _checked(
             f"views= selects {len(views)} views of {len(batch.scene)} scenes, but rendered and render_cameras have "
             f"[B, R] = {found[0]} and {found[1]}: render exactly the selected views"
         )
-    return RenderedViews(rendered, cameras, views.to(rendered.color.device)).map(_full_precision)

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from vg2gt.geometry.normals import normals_from_depth
-from vg2gt.losses.gaussian import normal_error, weighted_mean
-from vg2gt.losses.structure import structure_loss
+from vg2gt.losses.gaussian import normal_error, structure_loss, weighted_mean
 from vg2gt.types import Cameras, Gaussians, Render, TensorRecord
 
 
