@@ -18,7 +18,8 @@ from torch import Tensor
 
 from backends.base import Backend
 from vg2gt.io.files import write_cached
-from vg2gt.types import Cameras, Geometry, Hints, TensorRecord, Tokens
+from vg2gt.io.tensors import tensors_digest
+from vg2gt.types import Cameras, Geometry, Hints, Tokens
 
 log = logging.getLogger(__name__)
 
@@ -99,19 +100,12 @@ class TokenCache:
 def cache_key(backend: Backend, images: Tensor, hints: Hints | None) -> str:
     """Returns a hash of everything that determines the backend's output for these views."""
     source = _source(frozenset(base.__module__ for base in type(backend).__mro__))
-    made_by = (backend.identity(), _options(backend), source, images.device.type, torch.__version__)
-    digest = hashlib.sha256(repr(made_by).encode())
-
-    def add(tensor: Tensor) -> Tensor:
-        digest.update(f"{tuple(tensor.shape)} {tensor.dtype}".encode())
-        digest.update(tensor.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes())
-        return tensor
-
-    add(images)
-    if isinstance(hints, TensorRecord):
-        digest.update(repr(hints.scene_key).encode())
-        hints.map(add)
-    return digest.hexdigest()[:40]
+    made_by = [backend.identity(), _options(backend), source, images.device.type, torch.__version__]
+    tensors = {"images": images}
+    if hints is not None:
+        made_by.append(hints.scene_key)
+        hints.map(lambda tensor: tensors.setdefault(f"hint {len(tensors)}", tensor))
+    return hashlib.sha256(repr((*made_by, tensors_digest(tensors))).encode()).hexdigest()[:40]
 
 
 def _options(backend: Backend) -> list[tuple[str, str, object]]:

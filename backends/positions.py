@@ -84,18 +84,16 @@ def uv_embedding(channels: int, size: tuple[int, int], image_size: tuple[int, in
     """
     extent = size_tensor(image_size, like).double()
     y_extent, x_extent = (extent / extent.norm()).unbind()
-    y, x = (_centered(length, like.device) for length in size)
+    y, x = (
+        (2 * torch.arange(length, device=like.device, dtype=torch.float64) + 1) / length - 1  # pixel centres
+        for length in size
+    )
     quarter = channels // 4
     omega = 100.0 ** (-torch.arange(quarter, device=like.device, dtype=torch.float64) / quarter)
     columns, rows = omega[:, None, None] * (x * x_extent), omega[:, None, None] * (y * y_extent)[:, None]
     # Waves are constant along the other axis: compute them once, then expand.
     waves = [torch.cat((phase.sin(), phase.cos())).to(like.dtype) for phase in (columns, rows)]
     return torch.cat([wave.expand(-1, *size) for wave in waves])
-
-
-def _centered(length: int, device: torch.device) -> Tensor:
-    """Pixel centres from ``-(n - 1) / n`` to ``(n - 1) / n``, in float64."""
-    return (2 * torch.arange(length, device=device, dtype=torch.float64) + 1) / length - 1
 
 
 Rotary = tuple[Tensor, Tensor]

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from backends.positions import Rotary, grid_positions, resize_position_embedding, rotary_2d
 from backends.vit import FeedForward, PatchEmbed, ViTBlock, first_and_others
 
-ReferenceView = Literal["first", "middle", "saddle_balanced"]
+ReferenceView = Literal["first", "saddle_balanced"]
 MIN_VIEWS_TO_CHOOSE = 3
 
 
@@ -87,7 +87,7 @@ class Backbone(nn.Module):
         for index, block in enumerate(self.blocks):
             # move the reference view to the front, just before the multi-view blocks
             if choose and index == self.multiview_from - 1:
-                order = reference_first(select_reference(x[:, :, 0], reference), views)
+                order = reference_first(select_reference(x[:, :, 0]), views)
                 x = _take_views(x, order)
                 local = _take_views(local, order)
             if index == self.multiview_from:
@@ -141,30 +141,18 @@ class PretrainedBackbone(nn.Module):
         self.pretrained = pretrained
 
 
-def select_reference(tokens: Tensor, strategy: ReferenceView) -> Tensor:
-    """Chooses the reference view of each scene.
+def select_reference(tokens: Tensor) -> Tensor:
+    """Chooses the reference view of each scene as ``saddle_balanced`` does.
 
-    ``saddle_balanced`` scales three measures to [0, 1] over the views, and chooses the view closest to 0.5 in all of
-    them: mean cosine similarity to the other views, token norm, and variance of the normalised token.
+    Scales three measures to [0, 1] over the views, and chooses the view closest to 0.5 in all of them: mean cosine
+    similarity to the other views, token norm, and variance of the normalised token.
 
     Args:
         tokens: class tokens ``[B, V, C]``.
-        strategy: how to choose.
 
     Returns:
         Indices ``[B]``, int64; 0 for fewer than three views.
     """
-    batch, views = tokens.shape[:2]
-    if strategy == "first":
-        return torch.zeros(batch, dtype=torch.int64, device=tokens.device)
-    middle = torch.full((batch,), views // 2, dtype=torch.int64, device=tokens.device)
-    chosen = _saddle_balanced(tokens) if strategy == "saddle_balanced" else middle
-    # Compare as a tensor: a Python comparison would fix the number of views in an export.
-    enough = torch.full((), views, device=tokens.device) >= MIN_VIEWS_TO_CHOOSE
-    return torch.where(enough, chosen, 0)
-
-
-def _saddle_balanced(tokens: Tensor) -> Tensor:
     tokens = tokens.float()
     length = tokens.norm(dim=-1)
     unit = tokens / length[..., None]
@@ -172,7 +160,9 @@ def _saddle_balanced(tokens: Tensor) -> Tensor:
     measures = torch.stack((similarity, length, unit.var(-1)))
     low, high = measures.amin(-1, keepdim=True), measures.amax(-1, keepdim=True)
     scaled = (measures - low) / (high - low + 1e-8)
-    return (scaled - 0.5).abs().sum(0).argmin(-1)
+    # Compare as a tensor: a Python comparison would fix the number of views in an export.
+    enough = torch.full((), tokens.shape[1], device=tokens.device) >= MIN_VIEWS_TO_CHOOSE
+    return torch.where(enough, (scaled - 0.5).abs().sum(0).argmin(-1), 0)
 
 
 def reference_first(reference: Tensor, views: int) -> Tensor:

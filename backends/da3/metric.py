@@ -118,13 +118,11 @@ def fill_sky(depth: Tensor, sky: Tensor) -> Tensor:
         depth: ``[B, V, H, W]``.
         sky: sky score ``[B, V, H, W]``; sky from 0.3 on.
     """
-    is_sky = sky >= SKY_THRESHOLD
     filled = []
-    for scene, mask in zip(depth, is_sky, strict=True):
+    for scene, mask in zip(depth, sky >= SKY_THRESHOLD, strict=True):
         ground = scene[~mask]
-        if ground.numel() > MIN_PIXELS and mask.sum() > MIN_PIXELS:
-            scene = torch.where(mask, quantile(ground, FAR_QUANTILE), scene)
-        filled.append(scene)
+        enough = ground.numel() > MIN_PIXELS and mask.sum() > MIN_PIXELS
+        filled.append(torch.where(mask, quantile(ground, FAR_QUANTILE), scene) if enough else scene)
     return torch.stack(filled)
 
 
@@ -197,13 +195,12 @@ def far_ends(depth: Tensor, sky: Tensor, scale: Tensor) -> Tensor:
     Returns:
         ``[B]``, in the unit of ``depth``; infinity for a scene with at most ten pixels that are not sky.
     """
-    ends = []
-    for scene, score, metres_per_unit in zip(depth, sky, scale, strict=True):
+    ends = torch.full_like(scale, torch.inf)
+    for index, (scene, score) in enumerate(zip(depth, sky, strict=True)):
         ground = scene[score < SKY_THRESHOLD]
-        enough = ground.numel() > MIN_PIXELS
-        far = quantile(ground, FAR_QUANTILE) if enough else torch.full_like(metres_per_unit, torch.inf)
-        ends.append(torch.minimum(far, FARTHEST_SKY / metres_per_unit) if enough else far)
-    return torch.stack(ends)
+        if ground.numel() > MIN_PIXELS:
+            ends[index] = torch.minimum(quantile(ground, FAR_QUANTILE), FARTHEST_SKY / scale[index])
+    return ends
 
 
 def fit_scale(metric_depth: Tensor, sky: Tensor, geometry: Geometry) -> Tensor:
@@ -221,17 +218,13 @@ def fit_scale(metric_depth: Tensor, sky: Tensor, geometry: Geometry) -> Tensor:
         ``[B]``; 1 for a scene with at most ten pixels that are not sky, or without pixels to fit.
     """
     factors = []
-    ground = sky < SKY_THRESHOLD
-    for target, depth, confidence, usable in zip(
-        metric_depth, geometry.depth, geometry.depth_conf, ground, strict=True
-    ):
-        if usable.sum() <= MIN_PIXELS:
+    for target, depth, confidence, score in zip(metric_depth, geometry.depth, geometry.depth_conf, sky, strict=True):
+        sure = score < SKY_THRESHOLD
+        if sure.sum() > MIN_PIXELS:
+            sure = sure & (confidence >= quantile(confidence[sure], 0.5))
+            sure &= (depth > NEAREST) & (target > NEAREST_METRIC)
+            factor = (target[sure] * depth[sure]).sum() / depth[sure].square().sum()
+            factors.append(factor if sure.any() else torch.ones_like(factor))
+        else:
             factors.append(torch.ones_like(depth[0, 0, 0]))
-            continue
-        sure = usable & (confidence >= quantile(confidence[usable], 0.5))
-        sure &= (depth > NEAREST) & (target > NEAREST_METRIC)
-        if not sure.any():
-            factors.append(torch.ones_like(depth[0, 0, 0]))
-            continue
-        factors.append((target[sure] * depth[sure]).sum() / depth[sure].square().sum())
     return torch.stack(factors)

@@ -108,8 +108,8 @@ def wide_range(world_to_camera: Tensor) -> Tensor:
     return torch.stack((near, _WIDE[1] * extent))
 
 
-def agreed_range(depth: Tensor, agreement: Tensor, fallback: Tensor, share: float = 0.5) -> Tensor:
-    """Returns near and far ``[2]`` around the depths whose agreement is above ``share``.
+def agreed_range(depth: Tensor, agreement: Tensor, fallback: Tensor) -> Tensor:
+    """Returns near and far ``[2]`` around the depths whose agreement is above one half.
 
     Pixels are selected by agreement, not confidence, which is biased towards near, well textured surfaces.
 
@@ -117,9 +117,8 @@ def agreed_range(depth: Tensor, agreement: Tensor, fallback: Tensor, share: floa
         depth: depth of the pixels, of any shape.
         agreement: their agreement with the sources in [0, 1], of the same shape.
         fallback: range ``[2]`` to return if less than 1 % of the pixels agree.
-        share: threshold of agreement.
     """
-    agreed = depth[agreement > share].sort().values
+    agreed = depth[agreement > 0.5].sort().values
     if len(agreed) < 0.01 * depth.numel():
         return fallback
     low, high = agreed[int(0.01 * len(agreed))], agreed[int(0.99 * len(agreed))]

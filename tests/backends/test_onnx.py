@@ -132,15 +132,6 @@ def test_wrong_descriptions_are_refused(copy: Path, change: Callable[[dict[str, 
         OnnxBackend(str(copy))
 
 
-def test_weights_beside_the_graph_are_read(copy: Path, shallow_da3: Exportable) -> None:
-    """As for networks beyond 2 GB, whose weights do not fit into the ONNX file."""
-    onnx.save(onnx.load(copy / "encoder.onnx"), copy / "encoder.onnx", save_as_external_data=True, location="data.bin")
-    assert worst_difference(OnnxBackend(str(copy)), shallow_da3) <= LIMIT
-    (copy / "data.bin").unlink()
-    with pytest.raises(ValueError, match=r"cannot open .*encoder\.onnx"):
-        OnnxBackend(str(copy))
-
-
 def test_providers_are_checked(onnx_bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ValueError, match="auto, cpu, cuda"):
         OnnxBackend(str(onnx_bundle), provider="tpu")  # pyright: ignore[reportArgumentType]

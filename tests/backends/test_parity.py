@@ -24,7 +24,7 @@ from vg2gt.types import Cameras, Hints, Tokens
 
 TOLERANCE = 2e-5
 CASES = [("vggt_tiny", case) for case in range(3)]
-CASES += [("da3_tiny_mlp", case) for case in range(7)] + [("da3_tiny_swiglu", case) for case in range(2)]
+CASES += [("da3_tiny_mlp", case) for case in (0, 1, 2, 4, 5, 6)] + [("da3_tiny_swiglu", case) for case in range(2)]
 
 
 class Reference:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from vg2gt.geometry.normals import normals_from_depth
 from vg2gt.losses import GaussianLoss, VG2GTLoss
-from vg2gt.losses.gaussian import RenderTargets
+from vg2gt.losses.gaussian import RenderTargets, structure_loss, structure_reference
 from vg2gt.types import Cameras, Render
 
 SIZE = (20, 26)
@@ -159,3 +159,23 @@ def test_colours_that_do_not_count_change_nothing(case) -> None:
     assert (color.grad[..., :8] == 0).all()
     assert (color.grad[..., 8:] != 0).any()
     assert GaussianLoss()(other, cameras, targets, scale)["color_l1"] != one["color_l1"]
+
+
+def pictures(height: int, width: int) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    reference = torch.rand(2, 3, height, width, generator=generator)
+    images = reference + 0.2 * torch.randn(reference.shape, generator=generator)
+    images[0, :, : height // 2] = reference[0, :, : height // 2]
+    images[1, 0], reference[1, 0] = 0.25, 0.25  # flat: no variance
+    return images, reference
+
+
+@pytest.mark.parametrize("size", [(6, 6), (6, 40), (11, 17), (23, 300)])
+def test_the_compiled_loss_equals_the_plain_one(size: tuple[int, int]) -> None:
+    images, reference = pictures(*size)
+    found, exact = images.clone().requires_grad_(), images.double().requires_grad_()
+    loss, expected = structure_loss(found, reference), structure_reference(exact, reference.double())
+    assert type(loss.grad_fn).__name__ == "StructureBackward"
+    torch.testing.assert_close(loss.double(), expected, rtol=1e-6, atol=1e-7)
+    gradients = [torch.autograd.grad(3 * value, x)[0] for value, x in ((loss, found), (expected, exact))]
+    assert (gradients[0] - gradients[1]).abs().max() < 1e-5 * gradients[1].abs().max()

@@ -9,6 +9,7 @@ from hydra.utils import instantiate
 from vg2gt.config import compose
 from vg2gt.geometry.cameras import scale_translations
 from vg2gt.losses import EnhancementLoss, GaussianLoss, GeometryLoss, ScaleAlignment, VG2GTLoss
+from vg2gt.losses.geometry import TaskLoss
 
 DEPTH_TERMS = ["depth_conf", "depth_reg", "depth_grad", "point_conf", "point_reg", "point_grad"]
 GAUSSIAN_TERMS = ["color_l1", "ssim", "depth_consistency", "depth_gt", "normal"]
@@ -180,3 +181,29 @@ def test_wrong_inputs_are_named(sample) -> None:
             VG2GTLoss()(made.prediction, made.batch, made.rendered, *views)
     with pytest.raises(ValueError, match=r"loss\.align\.source.*'scene'"):
         ScaleAlignment("scene")
+    with pytest.raises(ValueError, match=r"loss\.enhance\.form.*'printed'"):
+        EnhancementLoss(form="printed")
+    with pytest.raises(ValueError, match=r"loss\.enhance\.on.*'conf'"):
+        EnhancementLoss(on="conf")
+
+
+def task(conf: float, reg: float, grad: float) -> TaskLoss:
+    return TaskLoss(*(torch.tensor(x, requires_grad=True) for x in (conf, reg, grad)))
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({}, 0.5),
+        ({"on": "reg"}, 0.0),
+        ({"on": "reg", "margin": 0.3}, 0.1),
+        ({"form": "paper_literal"}, 0.0),
+        ({"form": "paper_literal", "on": "reg"}, 0.2),
+    ],
+)
+def test_the_hinge_by_hand(options: dict, expected: float) -> None:
+    before, after = task(1.0, 0.5, 0.2), task(1.6, 0.3, 0.3)  # totals 1.7 and 2.2
+    assert float(EnhancementLoss(**options)(before, after).detach()) == pytest.approx(expected)
+    EnhancementLoss()(before, after).backward()  # only the loss after enhancement is trained
+    assert before.reg.grad is None
+    assert after.reg.grad == 1

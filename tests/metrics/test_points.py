@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from vg2gt.metrics import point_metrics
+from vg2gt.metrics import cv, point_metrics
 from vg2gt.metrics.points import thin
 
 
@@ -45,3 +45,20 @@ def test_thinning_keeps_one_point_per_cell() -> None:
     assert thin(points, 0.5).tolist() == points[[0, 2, 3]].tolist()
     dense = torch.cat((cloud(50, 0), cloud(50, 0) + 1e-6))
     assert point_metrics(dense, cloud(50, 0), 0.1, downsample=1e-3)["accuracy"] < 1e-6
+
+
+@pytest.mark.parametrize("k", [1, 8])
+def test_uniformity_matches_brute_force(k: int) -> None:
+    points = cloud(200, 0)
+    distances = torch.cdist(points, points).sort(-1).values[:, 1 : k + 1].mean(-1)
+    assert cv(points, k) == pytest.approx(float(distances.std(correction=0) / distances.mean()), rel=1e-6)
+
+
+def test_a_draw_of_queries_is_seeded_and_searches_the_whole_cloud() -> None:
+    points = cloud(4000, 0)
+    full, drawn = cv(points), cv(points, max_queries=1500, seed=3)
+    assert drawn == cv(points, max_queries=1500, seed=3)
+    assert drawn != cv(points, max_queries=1500, seed=4)
+    # Thinning the cloud itself would lengthen all distances and change the figure's meaning.
+    assert drawn == pytest.approx(full, rel=0.1)
+    assert cv(points, max_queries=4000) == full

@@ -17,7 +17,7 @@ from vg2gt.data import DataError, RGBDFolder
 from vg2gt.io.arrays import load_matrices, load_npy, load_npz, read_npz
 from vg2gt.io.errors import FormatError
 from vg2gt.io.tensors import read_tensors
-from vg2gt.metrics.lpips import load_lpips
+from vg2gt.metrics.images import load_lpips
 from vg2gt.runs.checkpoints import initialize_from, read_checkpoint
 from vg2gt.runs.load import load_model
 from vg2gt.training.checkpointing import AtomicCheckpointIO

@@ -13,13 +13,12 @@ from backends.base import Backend
 from backends.da3 import DA3Backend
 from backends.dpt import DPT
 from backends.network import normalize_images
-from vg2gt.baselines.pixels import SMALLEST_FOOTPRINT, Pixels, harmonic_gains, usable_pixels
+from vg2gt.baselines.pixels import SMALLEST_FOOTPRINT, PixelReconstructor, Pixels, ReadViews, harmonic_gains
 from vg2gt.geometry.precision import full_precision
 from vg2gt.geometry.rotations import matrix_to_quat, multiply_quats
 from vg2gt.method.additions.visibility import ViewCheck
-from vg2gt.model import Background, Reconstructor, SceneScale
-from vg2gt.profiling import stage
-from vg2gt.types import Cameras, Gaussians, Geometry, Hints, Prediction, Tokens
+from vg2gt.model import Background, SceneScale
+from vg2gt.types import Cameras, Gaussians, Geometry, Hints, Tokens
 
 MIN_SCALE, MAX_SCALE = 1e-5, 30.0  # in SCALE_UNIT times the sum of a pixel's sides
 SCALE_UNIT = 0.1
@@ -55,17 +54,15 @@ class GaussianHead(DPT):
         return torch.cat(parts).unflatten(0, images.shape[:2]).permute(0, 1, 3, 4, 2)
 
 
-class DA3Gaussians(Reconstructor):
+class DA3Gaussians(PixelReconstructor):
     """Gaussians of DA3's ``gs_head``, with the weights of the backend's checkpoint.
 
     The head expects cameras with the principal point at the image centre, half a pixel from DA3's cameras for depth.
-    :meth:`run_backbone` and :meth:`predict_cameras` return such cameras.
+    :meth:`run_backbone` and :meth:`predict_cameras` return such cameras. See :class:`vg2gt.model.Reconstructor` for the
+    other arguments.
 
     Args:
         backend: DA3 with a Gaussian head: GIANT, or random weights.
-        scale: fixes the scene unit.
-        background: see :class:`vg2gt.model.Reconstructor`.
-        visibility: see :class:`vg2gt.model.Reconstructor`.
 
     Raises:
         ValueError: if the backend has no Gaussian head.
@@ -99,23 +96,17 @@ class DA3Gaussians(Reconstructor):
         """See :meth:`vg2gt.model.Reconstructor.predict_cameras`."""
         return _centred(super().predict_cameras(images, hints))
 
+    def features(self, tokens: Tokens, images: Tensor) -> Tensor:
+        """Runs the Gaussian head."""
+        return self.head.predict(tokens, images, self.backend.head_chunk).flatten(0, 3)
+
     @torch.no_grad()
-    def forward(
-        self, images: Tensor, hints: Hints | None = None, generator: torch.Generator | None = None
-    ) -> Prediction:
-        """Reconstructs B scenes; see :meth:`vg2gt.model.Reconstructor.forward`. Deterministic."""
-        tokens, geometry, unit = self.read_views(images, hints)
-        support = self.support(geometry, hints)
-        keep = None if support is None else support.keep
-        with stage("fine"):
-            raw = self.head.predict(tokens, images, self.backend.head_chunk).flatten(0, 3)
-        with stage("gaussians"), torch.autocast(images.device.type, enabled=False):
-            pixels = usable_pixels(geometry.where(keep), images)
-            own = self.backend.decode_cameras(tokens).world_to_camera[..., :3, :3].mT.flatten(0, 1)
-            frame = geometry.cameras.world_to_camera[..., :3, :3].mT.flatten(0, 1) @ own.mT
-            gaussians = place(raw[pixels.rows], pixels, unit, matrix_to_quat(own), matrix_to_quat(frame))
-        gaussians = self.with_background(gaussians, images, geometry.depth)
-        return Prediction(geometry, geometry, unit, None, gaussians, keep)
+    def make_gaussians(self, features: Tensor, pixels: Pixels, views: ReadViews) -> Gaussians:
+        """Returns one Gaussian per pixel."""
+        tokens, geometry, unit = views
+        own = self.backend.decode_cameras(tokens).world_to_camera[..., :3, :3].mT.flatten(0, 1)
+        frame = geometry.cameras.world_to_camera[..., :3, :3].mT.flatten(0, 1) @ own.mT
+        return place(features, pixels, unit, matrix_to_quat(own), matrix_to_quat(frame))
 
 
 def place(raw: Tensor, pixels: Pixels, unit: Tensor, own: Tensor, frame: Tensor) -> Gaussians:
@@ -128,7 +119,7 @@ def place(raw: Tensor, pixels: Pixels, unit: Tensor, own: Tensor, frame: Tensor)
         own: ``[B * V, 4]`` camera-to-world quaternions predicted by the network.
         frame: ``[B * V, 4]`` quaternions from the network's world to the scene.
     """
-    shift, scale, rotation, color, change, opacity = raw.float().split(PARTS, -1)
+    shift, scale, rotation, color, change, opacity = raw.split(PARTS, -1)
     depth = pixels.depth + unit[pixels.batch] * change[:, 0]
     pixel = pixels.footprint / pixels.depth[:, None]  # sides at depth 1
     rays = pixels.rays + F.pad(shift * pixel, (0, 1))

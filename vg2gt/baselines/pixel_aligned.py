@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from vg2gt.baselines.pixels import PixelReconstructor, Pixels, harmonic_gains
+from backends.base import Backend
+from vg2gt.baselines.pixels import PixelReconstructor, Pixels, ReadViews, harmonic_gains
 from vg2gt.geometry.rotations import matrix_to_quat, multiply_quats
 from vg2gt.geometry.spherical_harmonics import MAX_DEGREE, rgb_to_sh
-from vg2gt.types import Gaussians, Geometry
+from vg2gt.method import DenseHead
+from vg2gt.method.additions.visibility import ViewCheck
+from vg2gt.model import Background, SceneScale
+from vg2gt.types import Gaussians, Tokens
 
 MAX_SCALE = 4.0  # footprints
 MIN_SCALE = 1e-2  # footprints: renderers need a finite inverse
@@ -103,11 +108,35 @@ class PixelHead(nn.Module):
 
 
 class PixelAligned(PixelReconstructor):
-    """One Gaussian for every pixel with a depth; only the dense head and the Gaussian head are trained."""
+    """One Gaussian for every pixel with a depth; only the dense head and the Gaussian head are trained.
 
-    def make_gaussians(self, features: Tensor, pixels: Pixels, geometry: Geometry) -> Gaussians:
-        """One Gaussian per pixel."""
-        return self.gaussians(features, pixels)[0]
+    See :class:`vg2gt.model.Reconstructor` for the other arguments.
+
+    Args:
+        dense_head: makes the dense head from ``token_dims`` and ``patch_size``.
+        gaussians: makes the pixel head from ``in_channels``.
+    """
+
+    def __init__(
+        self,
+        backend: Backend,
+        scale: SceneScale,
+        dense_head: Callable[..., DenseHead],
+        gaussians: Callable[..., nn.Module],
+        background: Background = "black",
+        visibility: ViewCheck | None = None,
+    ) -> None:
+        super().__init__(backend, scale, background, visibility)
+        self.dense_head = dense_head(token_dims=backend.token_dims, patch_size=backend.patch_size)
+        self.gaussians = gaussians(in_channels=self.dense_head.out_channels)
+
+    def features(self, tokens: Tokens, images: Tensor) -> Tensor:
+        """Runs the dense head."""
+        return self.dense_head(tokens, images).permute(0, 2, 3, 1).flatten(0, 2)
+
+    def make_gaussians(self, features: Tensor, pixels: Pixels, views: ReadViews) -> Gaussians:
+        """Returns one Gaussian per pixel."""
+        return self.gaussians(F.gelu(features), pixels)[0]
 
 
 def _logit(probability: float) -> float:

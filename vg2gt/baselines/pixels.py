@@ -4,22 +4,18 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor, nn
-from torch.nn import functional as F
+from torch import Tensor
 
-from backends.base import Backend
 from vg2gt.geometry.cameras import invert_rigid, ray_directions
 from vg2gt.geometry.spherical_harmonics import rotation_of_coefficients
-from vg2gt.method import DenseHead
-from vg2gt.method.additions.visibility import ViewCheck
-from vg2gt.model import Background, Reconstructor, SceneScale
+from vg2gt.model import Reconstructor
 from vg2gt.profiling import stage
-from vg2gt.types import Gaussians, Geometry, Hints, Prediction, TensorRecord
+from vg2gt.types import Gaussians, Geometry, Hints, Prediction, TensorRecord, Tokens
 
+ReadViews = tuple[Tokens, Geometry, Tensor]
 SMALLEST_FOOTPRINT = 1e-7  # scene units; a hundredth of it is still a valid scale for the renderer
 
 
@@ -99,43 +95,36 @@ def harmonic_gains(degree: int) -> Tensor:
 
 
 class PixelReconstructor(Reconstructor):
-    """Base class that decodes Gaussians from a dense head's features at every pixel; geometry is the backbone's own.
+    """Base class of models that make Gaussians of pixels; geometry is the backbone's own.
 
-    See :class:`vg2gt.model.Reconstructor` for the other arguments.
-
-    Args:
-        dense_head: makes the dense head from ``token_dims`` and ``patch_size``.
-        gaussians: makes the pixel head from ``in_channels``.
+    See :class:`vg2gt.model.Reconstructor` for the arguments.
     """
-
-    def __init__(
-        self,
-        backend: Backend,
-        scale: SceneScale,
-        dense_head: Callable[..., DenseHead],
-        gaussians: Callable[..., nn.Module],
-        background: Background = "black",
-        visibility: ViewCheck | None = None,
-    ) -> None:
-        super().__init__(backend, scale, background, visibility)
-        self.dense_head = dense_head(token_dims=backend.token_dims, patch_size=backend.patch_size)
-        self.gaussians = gaussians(in_channels=self.dense_head.out_channels)
 
     def forward(
         self, images: Tensor, hints: Hints | None = None, generator: torch.Generator | None = None
     ) -> Prediction:
         """Reconstructs B scenes; see :meth:`vg2gt.model.Reconstructor.forward`. Deterministic."""
-        tokens, geometry, unit = self.read_views(images, hints)
+        views = tokens, geometry, unit = self.read_views(images, hints)
         support = self.support(geometry, hints)
         keep = None if support is None else support.keep
         with stage("fine"):
-            dense = self.dense_head(tokens, images).permute(0, 2, 3, 1).flatten(0, 2)
+            features = self.features(tokens, images)
         with stage("gaussians"), torch.autocast(images.device.type, enabled=False):
             pixels = usable_pixels(geometry.where(keep), images)
-            features = F.gelu(dense.float()).index_select(0, pixels.rows)
-            gaussians = self.with_background(self.make_gaussians(features, pixels, geometry), images, geometry.depth)
+            gaussians = self.make_gaussians(features.index_select(0, pixels.rows).float(), pixels, views)
+        gaussians = self.with_background(gaussians, images, geometry.depth)
         return Prediction(geometry, geometry, unit, None, gaussians, keep)
 
+    def features(self, tokens: Tokens, images: Tensor) -> Tensor:
+        """Returns features of all pixels ``[B * V * H * W, C]``, by default of width 0."""
+        return images.new_zeros(images[:, :, 0].numel(), 0)
+
     @abstractmethod
-    def make_gaussians(self, features: Tensor, pixels: Pixels, geometry: Geometry) -> Gaussians:
-        """Returns the Gaussians of B scenes from the features ``[N, C]`` of their N usable pixels."""
+    def make_gaussians(self, features: Tensor, pixels: Pixels, views: ReadViews) -> Gaussians:
+        """Returns the Gaussians of B scenes.
+
+        Args:
+            features: features of the usable pixels ``[N, C]``.
+            pixels: the same N pixels.
+            views: result of :meth:`vg2gt.model.Reconstructor.read_views`.
+        """

@@ -8,30 +8,27 @@ import torch
 from torch import Tensor
 
 from backends.base import Backend
-from vg2gt.baselines.pixels import Pixels, usable_pixels
+from vg2gt.baselines.pixels import PixelReconstructor, Pixels, ReadViews
 from vg2gt.geometry.spherical_harmonics import rgb_to_sh
 from vg2gt.method.additions.visibility import ViewCheck
 from vg2gt.method.knn import nearest_neighbors
-from vg2gt.model import Background, Reconstructor, SceneScale
-from vg2gt.profiling import stage
-from vg2gt.types import Gaussians, Hints, Prediction
+from vg2gt.model import Background, SceneScale
+from vg2gt.types import Gaussians
 
 Spacing = Literal["pixel", "neighbors"]
 NEIGHBORS = 3
 
 
-class PointCloud(Reconstructor):
+class PointCloud(PixelReconstructor):
     """One isotropic Gaussian per pixel, as wide as the spacing of the points.
 
+    See :class:`vg2gt.model.Reconstructor` for the other arguments.
+
     Args:
-        backend: the frozen visual foundation model.
-        scale: fixes the scene unit.
         spacing: ``pixel``: size of the pixel at its depth. ``neighbors``: root mean square distance to the three
             nearest points; with ``opacity=0.1`` this is the 3DGS initialisation from a point cloud.
         width: standard deviation relative to the spacing.
         opacity: opacity of every Gaussian, in (0, 1).
-        background: see :class:`vg2gt.model.Reconstructor`.
-        visibility: see :class:`vg2gt.model.Reconstructor`.
 
     Raises:
         ValueError: if the spacing is unknown.
@@ -54,28 +51,18 @@ class PointCloud(Reconstructor):
         self.width = width
         self.opacity = opacity
 
-    @torch.no_grad()
-    def forward(
-        self, images: Tensor, hints: Hints | None = None, generator: torch.Generator | None = None
-    ) -> Prediction:
-        """Reconstructs B scenes; see :meth:`vg2gt.model.Reconstructor.forward`. Deterministic."""
-        _, geometry, unit = self.read_views(images, hints)
-        support = self.support(geometry, hints)
-        keep = None if support is None else support.keep
-        with stage("gaussians"), torch.autocast(images.device.type, enabled=False):
-            pixels = usable_pixels(geometry.where(keep), images)
-            means = pixels.to_world(pixels.rays * pixels.depth[:, None])
-            spacing = pixels.footprint.mean(-1) if self.spacing == "pixel" else _distance_to_neighbors(means, pixels)
-            gaussians = Gaussians(
-                means=means,
-                quats=means.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(means), 1),
-                scales=(self.width * spacing)[:, None].repeat(1, 3),
-                opacities=torch.full_like(spacing, self.opacity),
-                sh=rgb_to_sh(pixels.colors)[:, None],
-                batch=pixels.batch,
-            )
-        gaussians = self.with_background(gaussians, images, geometry.depth)
-        return Prediction(geometry, geometry, unit, None, gaussians, keep)
+    def make_gaussians(self, features: Tensor, pixels: Pixels, views: ReadViews) -> Gaussians:
+        """Returns one Gaussian per pixel; uses no features."""
+        means = pixels.to_world(pixels.rays * pixels.depth[:, None])
+        spacing = pixels.footprint.mean(-1) if self.spacing == "pixel" else _distance_to_neighbors(means, pixels)
+        return Gaussians(
+            means=means,
+            quats=means.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(means), 1),
+            scales=(self.width * spacing)[:, None].repeat(1, 3),
+            opacities=torch.full_like(spacing, self.opacity),
+            sh=rgb_to_sh(pixels.colors)[:, None],
+            batch=pixels.batch,
+        )
 
 
 def _distance_to_neighbors(means: Tensor, pixels: Pixels) -> Tensor:

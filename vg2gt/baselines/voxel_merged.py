@@ -9,30 +9,25 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from backends.base import Backend
-from vg2gt.baselines.pixels import PixelReconstructor, Pixels
+from vg2gt.baselines.pixel_aligned import PixelAligned
+from vg2gt.baselines.pixels import Pixels, ReadViews
 from vg2gt.method import DenseHead
 from vg2gt.method.additions.visibility import ViewCheck
 from vg2gt.method.grid import VoxelPlan, in_range, plan_voxels, point_cells, pool_mean, scene_voxel_size
 from vg2gt.model import Background, SceneScale
-from vg2gt.types import Gaussians, Geometry
+from vg2gt.types import Gaussians
 
 
-class VoxelMerged(PixelReconstructor):
+class VoxelMerged(PixelAligned):
     """Predicts one Gaussian per pixel, then merges all Gaussians of a voxel into their confidence-weighted mean.
 
     Merges decoded parameters, not features: no network sees a voxel as a whole, and each voxel holds one Gaussian.
     Scales are relative to the voxel where it is larger than the pixel, so that merged Gaussians leave no holes before
-    training.
+    training. See :class:`PixelAligned` for the other arguments.
 
     Args:
-        backend: the frozen visual foundation model.
-        scale: fixes the scene unit.
-        dense_head: makes the dense head from ``token_dims`` and ``patch_size``.
-        gaussians: makes the pixel head from ``in_channels``.
         voxel_size: edge length in scene units.
         min_footprint: smallest edge in pixels at the scene's median depth; 0: no limit.
-        background: see :class:`vg2gt.model.Reconstructor`.
-        visibility: see :class:`vg2gt.model.Reconstructor`.
     """
 
     def __init__(
@@ -50,10 +45,10 @@ class VoxelMerged(PixelReconstructor):
         self.voxel_size = voxel_size
         self.min_footprint = min_footprint
 
-    def make_gaussians(self, features: Tensor, pixels: Pixels, geometry: Geometry) -> Gaussians:
+    def make_gaussians(self, features: Tensor, pixels: Pixels, views: ReadViews) -> Gaussians:
         """Returns one Gaussian per occupied voxel."""
-        size = scene_voxel_size(geometry, self.voxel_size, self.min_footprint)
-        single, confidence = self.gaussians(features, pixels, min_footprint=size[pixels.batch])
+        size = scene_voxel_size(views[1], self.voxel_size, self.min_footprint)
+        single, confidence = self.gaussians(F.gelu(features), pixels, min_footprint=size[pixels.batch])
         return merge_by_voxel(single, confidence, size)
 
 

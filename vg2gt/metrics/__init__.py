@@ -1,10 +1,8 @@
 """Evaluation metrics: small pure functions."""
 
 from vg2gt.metrics.cameras import camera_metrics, relative_pose_errors
-from vg2gt.metrics.depth import depth_metrics, near_depth_edges
-from vg2gt.metrics.images import psnr, ssim
-from vg2gt.metrics.lpips import LPIPS, WeightsNotFoundError, load_lpips
-from vg2gt.metrics.normals import normal_metrics
+from vg2gt.metrics.depth import depth_metrics, near_depth_edges, normal_metrics
+from vg2gt.metrics.images import LPIPS, WeightsNotFoundError, load_lpips, psnr, ssim
 from vg2gt.metrics.points import cv, point_metrics
 from vg2gt.metrics.stated import ause, stated_error_metrics
 

@@ -1,4 +1,4 @@
-"""Depth errors after alignment (paper, eq_delta_n), and depth edges."""
+"""Errors of depth after alignment (paper, eq_delta_n) and of normals, and depth edges."""
 
 from __future__ import annotations
 
@@ -14,6 +14,10 @@ ALIGNMENTS = ("median", "scene", "wmed", "scale_shift", "none")
 DELTAS = (1.25, 1.05, 1.03)
 NAMES = ("abs_rel", "mae", "rmse", *(f"delta_{d}" for d in DELTAS), "coverage", *(f"delta_{d}_holes" for d in DELTAS))
 SMALLEST = 1e-6
+EDGE = 0.05  # relative step of depth between neighbouring pixels
+
+NORMAL_ACCURACIES = (10, 30)  # degrees
+NORMAL_NAMES = ("mean", "median", *(f"acc_{a}" for a in NORMAL_ACCURACIES), "cosine")
 
 
 def depth_metrics(
@@ -91,29 +95,55 @@ def _score(predicted: Tensor, reference: Tensor, coverage: Tensor) -> dict[str, 
     return results
 
 
-EDGE = 0.05  # relative step of depth between neighbouring pixels
-NEAR = 3  # pixels
-
-
-def near_depth_edges(depth: Tensor, step: float = EDGE, near: int = NEAR) -> Tensor:
-    """Marks pixels at most ``near`` pixels (along either axis) from a depth edge.
+def normal_metrics(predicted: Tensor, reference: Tensor, valid: Tensor) -> dict[str, float]:
+    """Scores the normal maps of one scene: pixels are averaged per image, images per scene.
 
     Args:
-        depth: ``[..., H, W]`` z-depth, 0 = invalid; steps to invalid pixels are not edges.
-        step: relative difference between neighbours above which there is an edge.
-        near: distance in pixels.
+        predicted: ``[V, 3, H, W]``, any length; pixels of length 0 are left out.
+        reference: ``[V, 3, H, W]`` in the same frame, any length.
+        valid: ``[V, H, W]`` bool.
 
     Returns:
-        ``[..., H, W]`` bool.
+        ``mean`` and ``median`` angle in degrees, ``acc_10`` and ``acc_30`` (shares of pixels below that many degrees),
+        ``cosine``; NaN without valid pixels.
+
+    Raises:
+        ValueError: if the shapes do not match.
     """
-    valid = depth > 0
-    edges = torch.zeros_like(valid)
+    if predicted.shape != reference.shape or predicted.shape[:1] + predicted.shape[2:] != valid.shape:
+        raise ValueError(
+            f"normals must be [V, 3, H, W] and valid [V, H, W], got {tuple(predicted.shape)}, {tuple(reference.shape)} "
+            f"and {tuple(valid.shape)}"
+        )
+    predicted, reference = predicted.double(), reference.double()
+    lengths = predicted.norm(dim=1) * reference.norm(dim=1)
+    valid = valid & (lengths > 0)
+    dot = (predicted * reference).sum(1)
+    cosine = dot / torch.where(valid, lengths, 1.0)
+    # atan2 keeps its precision at small angles, where acos has none.
+    angle = torch.atan2(torch.linalg.cross(predicted, reference, dim=1).norm(dim=1), dot).rad2deg()
+    images = [_score_normals(a[v], c[v]) for a, c, v in zip(angle, cosine, valid, strict=True) if v.any()]
+    return {name: float(torch.stack([i[name] for i in images]).mean()) if images else math.nan for name in NORMAL_NAMES}
+
+
+def _score_normals(angle: Tensor, cosine: Tensor) -> dict[str, Tensor]:
+    results = {"mean": angle.mean(), "median": angle.median(), "cosine": cosine.mean()}
+    return results | {f"acc_{a}": (angle < a).double().mean() for a in NORMAL_ACCURACIES}
+
+
+def near_depth_edges(depth: Tensor) -> Tensor:
+    """Marks the pixels of depth ``[..., H, W]`` at most 3 pixels (along either axis) from a relative step over 5 %.
+
+    Steps to invalid pixels (depth 0) are no edges.
+    """
+    edges = torch.zeros_like(depth, dtype=torch.bool)
     for axis in (-1, -2):
-        first, second = depth.narrow(axis, 0, depth.shape[axis] - 1), depth.narrow(axis, 1, depth.shape[axis] - 1)
-        both = valid.narrow(axis, 0, depth.shape[axis] - 1) & valid.narrow(axis, 1, depth.shape[axis] - 1)
-        broken = both & ((first - second).abs() > step * torch.minimum(first, second))
-        edges.narrow(axis, 0, depth.shape[axis] - 1).logical_or_(broken)
-        edges.narrow(axis, 1, depth.shape[axis] - 1).logical_or_(broken)
+        count = depth.shape[axis] - 1
+        first, second = depth.narrow(axis, 0, count), depth.narrow(axis, 1, count)
+        nearer = torch.minimum(first, second)
+        broken = (nearer > 0) & ((first - second).abs() > EDGE * nearer)
+        edges.narrow(axis, 0, count).logical_or_(broken)
+        edges.narrow(axis, 1, count).logical_or_(broken)
     flat = edges.to(torch.float32).flatten(0, -3)[:, None]  # [N, 1, H, W]
-    # A pixel next to an edge is half a pixel from it: near - 1 more steps reach the distance.
-    return (F.max_pool2d(flat, 2 * near - 1, 1, near - 1) > 0).reshape(depth.shape)
+    # A pixel next to an edge is half a pixel from it: two more steps reach the distance.
+    return (F.max_pool2d(flat, 5, 1, 2) > 0).reshape(depth.shape)

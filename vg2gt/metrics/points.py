@@ -63,11 +63,8 @@ def thin(points: NDArray[np.float64], edge: float | None) -> NDArray[np.float64]
     """Keeps the first of the points ``[N, 3]`` in each cubic cell of edge ``edge``; all points if it is None."""
     if edge is None or not len(points):
         return points
-    cells = np.floor((points - points.min(0)) / edge)
-    order = np.lexsort(cells.T)  # stable: the first of a cell is the first of the points
-    cells = cells[order]
-    begins = np.concatenate(([True], (cells[1:] != cells[:-1]).any(1)))
-    return points[np.sort(order[begins])]
+    _, first = np.unique(np.floor((points - points.min(0)) / edge), axis=0, return_index=True)
+    return points[np.sort(first)]
 
 
 def _mean_below(distances: NDArray[np.float64], cap: float | None) -> float:
