@@ -124,7 +124,9 @@ class OracleBackend(Backend):
             relative, poses, doubt = self._draw(hints, (height, width), depth)
             cameras = self._predict_cameras(scale_translations(hints.cameras, unit), depth, poses)
             predicted = _bleed(depth * (1 + self.depth_noise * relative))
-            confidence = self._predict_confidence(predicted, depth, doubt)
+            error = (predicted / depth.clamp_min(1e-6) - 1).abs()
+            confidence = 1 + 4 * torch.exp(-error / max(self.depth_noise, 0.01)) * torch.exp(0.3 * doubt)
+            confidence = torch.where(depth > 0, confidence, INVALID_CONFIDENCE)
             if self.background is not None:
                 far = self.background * depth.amax((1, 2, 3), keepdim=True)
                 predicted = torch.where(depth > 0, predicted, far)
@@ -180,11 +182,6 @@ class OracleBackend(Backend):
         error[:, 0] = identity
         exact = relative_to_first(cameras.map(Tensor.double)).map(Tensor.float)
         return Cameras(invert_rigid(error) @ exact.world_to_camera, exact.intrinsics, exact.size)
-
-    def _predict_confidence(self, predicted: Tensor, depth: Tensor, doubt: Tensor) -> Tensor:
-        error = (predicted / depth.clamp_min(1e-6) - 1).abs()
-        confidence = 1 + 4 * torch.exp(-error / max(self.depth_noise, 0.01)) * torch.exp(0.3 * doubt)
-        return torch.where(depth > 0, confidence, INVALID_CONFIDENCE)
 
     def _tokens(self, images: Tensor, geometry: Tensor) -> tuple[Tensor, ...]:
         """Mixes the image features of every tapped block with the geometry ``[B, V, P, 32]``."""

@@ -133,14 +133,6 @@ class Backbone(nn.Module):
         return patch, torch.cat((local[:, :, 0], x[:, :, 0]), -1)
 
 
-class PretrainedBackbone(nn.Module):
-    """Wraps a backbone to match its name in the published files."""
-
-    def __init__(self, pretrained: Backbone) -> None:
-        super().__init__()
-        self.pretrained = pretrained
-
-
 def select_reference(tokens: Tensor) -> Tensor:
     """Chooses the reference view of each scene as ``saddle_balanced`` does.
 

@@ -8,7 +8,7 @@ from typing import get_args
 import torch
 from torch import Tensor, nn
 
-from backends.da3.backbone import Backbone, PretrainedBackbone, ReferenceView
+from backends.da3.backbone import Backbone, ReferenceView
 from backends.dpt import DPT, in_chunks
 from backends.network import NetworkBackend, decode_pose, encode_pose, normalize_images, predict
 from backends.vit import FeedForward, ViTBlock, ViTMLP
@@ -108,7 +108,7 @@ class DA3Network(DA3Decoder):
     ) -> None:
         token_dim = 2 * backbone.cls_token.shape[-1]
         super().__init__(token_dim, features, out_channels, backbone.patch_size)
-        self.backbone = PretrainedBackbone(backbone)
+        self.backbone = nn.ModuleDict({"pretrained": backbone})
         self.cam_enc = cam_enc
 
 
@@ -190,7 +190,7 @@ class DA3Backend(NetworkBackend):
         if self.network.cam_enc is not None and hints is not None and hints.cameras is not None:
             with full_precision(images):
                 given = self.network.cam_enc(normalize_cameras(hints.cameras))
-        backbone = self.network.backbone.pretrained
+        backbone = self.network.backbone["pretrained"]
         with half_precision_on_gpu(images):
             patch, camera = backbone(normalize_images(images), self.taps, self.reference_view, given)
         return self.as_tokens(images, patch, camera)

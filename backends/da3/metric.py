@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from backends.base import Backend
-from backends.da3.backbone import Backbone, PretrainedBackbone
+from backends.da3.backbone import Backbone
 from backends.da3.backend import NESTED_PARTS, DA3Backend
 from backends.dpt import DPT, in_chunks
 from backends.network import NetworkBackend, normalize_images
@@ -33,7 +33,7 @@ class DA3MetricNetwork(nn.Module):
 
     def __init__(self, backbone: Backbone, head: DPT) -> None:
         super().__init__()
-        self.backbone = PretrainedBackbone(backbone)
+        self.backbone = nn.ModuleDict({"pretrained": backbone})
         self.head = head
 
 
@@ -83,7 +83,7 @@ class DA3MetricBackend(NetworkBackend):
         hints = self.require_hints(images, hints, "cameras")
         assert hints.cameras is not None
         with half_precision_on_gpu(images):
-            patch, camera = self.network.backbone.pretrained(normalize_images(images), self.taps)
+            patch, camera = self.network.backbone["pretrained"](normalize_images(images), self.taps)
         tokens = self.as_tokens(images, patch, camera)
         return replace(tokens, state={"cameras": hints.cameras, "factor": metres(hints.cameras)})
 

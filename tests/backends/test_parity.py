@@ -125,7 +125,7 @@ def test_multi_view(weights: Callable[[str], str], network: str, case: int) -> N
         cameras = Cameras(reference.tensors["in_extrinsics_w2c"], reference.tensors["in_intrinsics"], size)
         given = backend.network.cam_enc(cameras)
         reference.check("given", given)
-        backbone, normalised = backend.network.backbone.pretrained, normalize_images(images)
+        backbone, normalised = backend.network.backbone["pretrained"], normalize_images(images)
         tokens = backend.as_tokens(images, *backbone(normalised, backend.taps, backend.reference_view, given))
     else:
         tokens = backend.encode(images)

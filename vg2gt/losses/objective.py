@@ -123,9 +123,15 @@ class VG2GTLoss(nn.Module):
             render_cameras: the R cameras used for rendering.
 
         Raises:
-            ValueError: if geometry, renders, views and cameras do not match.
+            ValueError: if prediction and batch do not match.
         """
-        _check_shapes(prediction, batch, rendered, views, render_cameras)
+        found = prediction.geometry.depth.shape
+        expected = (len(batch.scene), batch.num_context, *batch.images.shape[-2:])
+        if found != expected:
+            raise ValueError(
+                f"prediction.geometry.depth is {tuple(found)}, but the batch has context views {expected}: pass the "
+                "prediction made from batch.context"
+            )
         with torch.autocast(batch.images.device.type, enabled=False):
             # one scale per scene from the prediction to the ground truth's unit: [B]
             truth = normalize_truth(batch.map(_full_precision))
@@ -141,7 +147,7 @@ class VG2GTLoss(nn.Module):
             valid = context.valid & (initial.depth > 0) & (enhanced.depth > 0)
             before, after = to_unit(initial, initial_scale), to_unit(enhanced, scale)
             scenes = [
-                self._geometry_terms(_one(before, i), _one(after, i), context.scene(i), valid[i : i + 1])
+                self._geometry_terms(_one(before, i), _one(after, i), _one(context, i), valid[i : i + 1])
                 for i in range(len(batch.scene))
             ]
             # losses of the R rendered views
@@ -202,25 +208,3 @@ def _render_targets(batch: Batch, geometry: Geometry, truth: Truth, views: Tenso
 
 def _full_precision(tensor: Tensor) -> Tensor:
     return tensor.float() if tensor.dtype in (torch.float16, torch.bfloat16) else tensor
-
-
-def _check_shapes(
-    prediction: Decoded, batch: Batch, rendered: Render | None, views: Tensor | None, cameras: Cameras | None
-) -> None:
-    expected = (len(batch.scene), batch.num_context, *batch.images.shape[-2:])
-    for name, geometry in (("initial", prediction.initial), ("geometry", prediction.geometry)):
-        if tuple(geometry.depth.shape) != expected:
-            raise ValueError(
-                f"prediction.{name}.depth is {tuple(geometry.depth.shape)}, but the batch has context views "
-                f"{expected}: pass the prediction made from batch.context"
-            )
-    if rendered is None:
-        return
-    if views is None or cameras is None:
-        raise ValueError("rendered= requires views= (indices of the rendered views in the batch) and render_cameras=")
-    found = (tuple(rendered.color.shape[:2]), tuple(cameras.world_to_camera.shape[:2]))
-    if found != ((len(batch.scene), len(views)),) * 2:
-        raise ValueError(
-            f"views= selects {len(views)} views of {len(batch.scene)} scenes, but rendered and render_cameras have "
-            f"[B, R] = {found[0]} and {found[1]}: render exactly the selected views"
-        )

@@ -37,11 +37,6 @@ class Truth(TensorRecord):
         """Returns the truth of some views."""
         return Truth(self.depth[:, views], self.valid[:, views], self.cameras.select(views), self.unit, self.known)
 
-    def scene(self, index: int) -> Truth:
-        """Returns the truth of one scene (B = 1)."""
-        rows = slice(index, index + 1)
-        return Truth(self.depth[rows], self.valid[rows], self.cameras.scene(index), self.unit[rows], self.known[rows])
-
 
 def normalize_truth(batch: Batch) -> Truth:
     """Converts a batch's depth and cameras to the losses' frame and unit.

@@ -40,13 +40,8 @@ def depth_metrics(
         in which holes count as failures. Images without usable pixels are left out; NaN if none remain.
 
     Raises:
-        ValueError: if the shapes differ or the alignment is unknown.
+        ValueError: if the alignment is unknown.
     """
-    if predicted.shape != reference.shape or predicted.dim() != 3:
-        raise ValueError(
-            f"depth maps must both be [V, H, W], got predicted {tuple(predicted.shape)} and reference "
-            f"{tuple(reference.shape)}"
-        )
     if alignment not in ALIGNMENTS:
         raise ValueError(f"alignment must be one of {ALIGNMENTS}, got {alignment!r}")
     predicted, reference = predicted.double(), reference.double()
@@ -106,15 +101,7 @@ def normal_metrics(predicted: Tensor, reference: Tensor, valid: Tensor) -> dict[
     Returns:
         ``mean`` and ``median`` angle in degrees, ``acc_10`` and ``acc_30`` (shares of pixels below that many degrees),
         ``cosine``; NaN without valid pixels.
-
-    Raises:
-        ValueError: if the shapes do not match.
     """
-    if predicted.shape != reference.shape or predicted.shape[:1] + predicted.shape[2:] != valid.shape:
-        raise ValueError(
-            f"normals must be [V, 3, H, W] and valid [V, H, W], got {tuple(predicted.shape)}, {tuple(reference.shape)} "
-            f"and {tuple(valid.shape)}"
-        )
     predicted, reference = predicted.double(), reference.double()
     lengths = predicted.norm(dim=1) * reference.norm(dim=1)
     valid = valid & (lengths > 0)

@@ -19,7 +19,7 @@ def point_metrics(
     downsample: float | None = None,
     cap: float | None = None,
 ) -> dict[str, float]:
-    """Compares two point clouds ``[N, 3]`` and ``[M, 3]`` in one frame and unit.
+    """Compares two point clouds in one frame and unit.
 
     Args:
         predicted: ``[N, 3]``.
@@ -32,16 +32,7 @@ def point_metrics(
         ``accuracy`` (mean distance from a predicted point to the reference), ``completeness`` (the other way round),
         ``chamfer`` (the mean of both), ``precision``, ``recall`` (shares of those distances below the threshold) and
         ``f_score``, their harmonic mean; NaN if a cloud is empty or the cap leaves nothing.
-
-    Raises:
-        ValueError: if a cloud is not ``[N, 3]`` or a length is not positive.
     """
-    for name, cloud in (("predicted", predicted), ("reference", reference)):
-        if cloud.dim() != 2 or cloud.shape[1] != 3:
-            raise ValueError(f"{name} points must be [N, 3], got {tuple(cloud.shape)}")
-    for name, length in (("threshold", threshold), ("downsample", downsample), ("cap", cap)):
-        if length is not None and not length > 0:
-            raise ValueError(f"{name} must be a positive length, got {length}")
     first, second = (thin(cloud.detach().cpu().double().numpy(), downsample) for cloud in (predicted, reference))
     if not len(first) or not len(second):
         return dict.fromkeys(NAMES, math.nan)
