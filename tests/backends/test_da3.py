@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from backends.da3.backend import normalize_cameras
-from backends.da3.metric import fill_sky, fit_scale
+from backends.da3.metric import fit_scale
 from vg2gt.geometry.cameras import invert_rigid, relative_to_first
 from vg2gt.types import Cameras, Geometry, Hints
 
@@ -72,16 +72,6 @@ def test_metric_depth_grows_with_the_focal_length(make_backend, make_scene) -> N
     torch.testing.assert_close(two.depth, 2 * one.depth)
     assert torch.equal(one.cameras.world_to_camera, hints.cameras.world_to_camera)
     assert torch.equal(one.depth_conf, torch.ones_like(one.depth))
-
-
-def test_sky_is_far() -> None:
-    depth = torch.linspace(1, 2, 800).reshape(1, 2, 20, 20)
-    sky = torch.zeros_like(depth)
-    sky[0, 0, :5] = 0.5
-    filled = fill_sky(depth, sky)
-    torch.testing.assert_close(filled[0, 0, :5], depth[sky == 0].quantile(0.99).expand(5, 20))
-    assert torch.equal(filled[sky == 0], depth[sky == 0])
-    assert torch.equal(fill_sky(depth, torch.ones_like(depth)), depth)  # nothing but sky: nothing to go by
 
 
 def test_nested_scale_ignores_sky_and_doubt() -> None:

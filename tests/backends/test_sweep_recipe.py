@@ -14,7 +14,7 @@ from backends.sweep.backend import SHIPPED, SweepBackend
 from backends.sweep.network import PosedViews, Sweep, SweepEncoding
 from backends.sweep.volume import from_inverse
 from recipes.sweep.objective import cell_inverse, objective
-from recipes.sweep.samples import Sample, TrainingSamples, recolour
+from recipes.sweep.samples import Sample, TrainingSamples
 from recipes.sweep.scenes import make_scenes, read_infinigen, read_scene
 from recipes.sweep.weights import newest_checkpoint
 from tests.commands import ROOT
@@ -96,15 +96,6 @@ def test_scenes_of_a_sample_are_encoded_as_if_alone(scenes: list[Path]) -> None:
     torch.testing.assert_close(as_used, alone[1].taps[-1], rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(both.taps[-1], torch.cat([part.taps[-1] for part in alone]), rtol=1e-3, atol=1e-3)
     torch.testing.assert_close(both.swept, torch.cat([part.swept for part in alone]), rtol=1e-3, atol=1e-3)
-
-
-def test_recolouring_keeps_range_and_shape() -> None:
-    images = torch.rand(4, 3, 16, 24, generator=torch.Generator().manual_seed(0))
-    for seed in range(8):
-        changed = recolour(images, np.random.default_rng(seed))
-        assert changed.shape == images.shape
-        assert 0 <= float(changed.min()) <= float(changed.max()) <= 1
-        assert not torch.equal(changed, images)
 
 
 def slanted(rows: torch.Tensor, columns: torch.Tensor) -> torch.Tensor:

@@ -11,8 +11,8 @@ from safetensors.torch import save_file
 
 from tests.training_helpers import SMALL, small_config
 from vg2gt.baselines import VoxelMerged
+from vg2gt.baselines.pixel_aligned import merge_by_voxel
 from vg2gt.baselines.pixels import usable_pixels
-from vg2gt.baselines.voxel_merged import merge_by_voxel
 from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.geometry.spherical_harmonics import sh_to_rgb
 from vg2gt.model import Reconstructor

@@ -122,17 +122,6 @@ def test_a_scene_without_depth_still_trains_its_colours(sample, align: ScaleAlig
         assert bool(leaf.grad[1].any()) is (name not in ("depth", "conf")), name
 
 
-def test_a_batch_without_any_depth_keeps_its_graph(sample) -> None:
-    made = sample()
-    depth = made.prediction.geometry.depth.clone().requires_grad_()
-    made = made.with_truth(torch.zeros_like(made.batch.depth)).with_depth(depth)
-    report = VG2GTLoss()(made.prediction, made.batch)
-    report.total.backward()
-    assert (float(report.total.detach()), report.skipped) == (0, 1)
-    assert depth.grad is not None
-    assert all(torch.isfinite(value) for value in report.terms.values())
-
-
 def test_cameras_are_logged_and_not_trained(sample) -> None:
     made = noisy(sample())
     base = VG2GTLoss()(*made.inputs)

@@ -29,17 +29,6 @@ def test_matches_brute_force(cap: float | None) -> None:
     assert found == pytest.approx(expected, rel=1e-9)
 
 
-def test_a_shifted_plane_and_a_half_of_it() -> None:
-    x, y = torch.meshgrid(torch.arange(20.0), torch.arange(20.0), indexing="ij")
-    plane = torch.stack((x, y, 0 * x), -1).reshape(-1, 3)
-    half = plane[plane[:, 0] < 10] + torch.tensor([0, 0, 0.3])
-    found = point_metrics(half, plane, threshold=0.5)
-    completeness = np.mean([np.hypot(max(column - 9, 0), 0.3) for column in range(20)])
-    assert (found["precision"], found["recall"]) == (1.0, 0.5)
-    expected = {"accuracy": 0.3, "f_score": 2 / 3, "completeness": completeness}
-    assert {name: found[name] for name in expected} == pytest.approx(expected)
-
-
 def test_thinning_keeps_one_point_per_cell() -> None:
     points = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.6, 0, 0], [0.0, 0.6, 0], [0.05, 0.05, 0.05]])
     assert thin(points, 0.5).tolist() == points[[0, 2, 3]].tolist()

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+import vg2gt.baselines.pixel_aligned
 import vg2gt.baselines.pixels
-import vg2gt.baselines.voxel_merged
 import vg2gt.losses.objective
 import vg2gt.method.additions.surface_evidence
 import vg2gt.method.coarse
@@ -163,7 +163,7 @@ PLACES = [
 ]
 BASELINE_PLACES = [
     (vg2gt.baselines.pixels, "ray_directions"),
-    *places(vg2gt.baselines.voxel_merged, "point_cells pool_mean"),
+    *places(vg2gt.baselines.pixel_aligned, "point_cells pool_mean"),
     (Renderer, "__call__"),
 ]
 

@@ -1,8 +1,7 @@
 """Baseline models on the same frozen backbone, losses and data (paper, Baselines)."""
 
 from vg2gt.baselines.da3_gaussians import DA3Gaussians
-from vg2gt.baselines.pixel_aligned import PixelAligned, PixelHead
+from vg2gt.baselines.pixel_aligned import PixelAligned, PixelHead, VoxelMerged
 from vg2gt.baselines.pointcloud import PointCloud
-from vg2gt.baselines.voxel_merged import VoxelMerged
 
 __all__ = ["DA3Gaussians", "PixelAligned", "PixelHead", "PointCloud", "VoxelMerged"]
