@@ -91,7 +91,9 @@ class Backbone(nn.Module):
                 x = _take_views(x, order)
                 local = _take_views(local, order)
             if index == self.multiview_from:
-                x = torch.cat((self._camera_tokens(x, camera_tokens), x[:, :, 1:]), 2)
+                learned = first_and_others(self.camera_token, views).expand(batch, -1, -1)
+                token = learned if camera_tokens is None else camera_tokens  # [B, V, C]
+                x = torch.cat((token[:, :, None].to(x.dtype), x[:, :, 1:]), 2)
             # attend over all views: [B, V N, C], or within each: [B V, N, C]
             if index >= self.multiview_from and index % 2 == 1:
                 x = block(x.flatten(1, 2), global_rotary).unflatten(1, (views, -1))
@@ -118,13 +120,6 @@ class Backbone(nn.Module):
         within = rotary_2d(torch.cat((special, patches)), self.head_dim)
         cos, sin = rotary_2d(torch.cat((special, torch.ones_like(patches))), self.head_dim)
         return within, (cos.repeat(views, 1), sin.repeat(views, 1))
-
-    def _camera_tokens(self, x: Tensor, given: Tensor | None) -> Tensor:
-        """Camera tokens ``[B, V, 1, C]``."""
-        if given is not None:
-            return given[:, :, None].to(x.dtype)
-        tokens = first_and_others(self.camera_token, x.shape[1])
-        return tokens[:, :, None].expand(x.shape[0], -1, -1, -1).to(x.dtype)
 
     def _tap(self, local: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
         if self.multiview_from == len(self.blocks):

@@ -114,7 +114,8 @@ class _Correlate(torch.autograd.Function):
         shape = (views, sources, *inverse.shape[1:])
         similarity = torch.empty(*shape, GROUPS)
         inside = torch.empty(shape, dtype=torch.bool)
-        geometry = _arrays(maps, warp.sources, warp.at_infinity, warp.parallax, inverse)
+        tensors = (maps, warp.sources, warp.at_infinity, warp.parallax, inverse)
+        geometry = tuple(tensor.detach().contiguous().numpy() for tensor in tensors)
         _forward(geometry, warp.first, similarity.numpy(), inside.numpy())
         ctx.geometry, ctx.first = geometry, warp.first
         ctx.mark_non_differentiable(inside)
@@ -127,10 +128,6 @@ class _Correlate(torch.autograd.Function):
         gradient = np.zeros_like(maps)
         _backward(ctx.geometry, ctx.first, gradients[0].contiguous().numpy(), gradient)
         return torch.from_numpy(gradient).permute(0, 3, 1, 2), None, None
-
-
-def _arrays(*tensors: Tensor) -> tuple[np.ndarray, ...]:
-    return tuple(tensor.detach().contiguous().numpy() for tensor in tensors)
 
 
 @kernel(fastmath=True, error_model="numpy", nogil=True, inline="always")

@@ -1,4 +1,4 @@
-"""Gaussians from a dense head on the frozen tokens: one per pixel, as many models do, or merged by voxels (AnySplat)."""
+"""Gaussians from a dense head on the frozen tokens: one per pixel, as many models do, or merged by voxel (AnySplat)."""
 
 from __future__ import annotations
 

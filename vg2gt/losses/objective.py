@@ -11,7 +11,7 @@ from torch.nn import functional as F
 
 from vg2gt.losses.gaussian import GaussianLoss, RenderTargets
 from vg2gt.losses.geometry import GeometryLoss, TaskLoss, camera_errors
-from vg2gt.losses.truth import ScaleAlignment, Truth, normalize_truth, to_unit
+from vg2gt.losses.truth import ScaleAlignment, Truth, fit_scale, normalize_truth, to_unit
 from vg2gt.types import Batch, Cameras, Decoded, Geometry, Render, TensorRecord
 
 Record = TypeVar("Record", bound=TensorRecord)
@@ -136,14 +136,18 @@ class VG2GTLoss(nn.Module):
             # one scale per scene from the prediction to the ground truth's unit: [B]
             truth = normalize_truth(batch.map(_full_precision))
             initial, enhanced = (g.map(_full_precision) for g in (prediction.initial, prediction.geometry))
-            initial_scale = self.align.fit(initial, truth)
-            scale = initial_scale if self.align.source == "initial" else self.align.fit(enhanced, truth)
+            context = truth.views(slice(0, batch.num_context))
+            initial_scale = fit_scale(initial.depth, context, context.valid)
+            scale = initial_scale
+            if self.align.source != "initial":
+                scale = fit_scale(enhanced.depth, context, context.valid)
             if rendered is not None and views is not None and render_cameras is not None:
                 rendered, cameras = rendered.map(_full_precision), render_cameras.map(_full_precision)
                 views = views.to(rendered.color.device)
-                scale = self.align.fit_rendered(rendered.depth, self.gaussian.hits(rendered), views, truth, scale)
+                if self.align.source == "rendered":
+                    shown = truth.views(views)
+                    scale = fit_scale(rendered.depth, shown, shown.valid & self.gaussian.hits(rendered), scale)
             # geometry and enhancement losses of the context views
-            context = truth.views(slice(0, batch.num_context))
             valid = context.valid & (initial.depth > 0) & (enhanced.depth > 0)
             before, after = to_unit(initial, initial_scale), to_unit(enhanced, scale)
             scenes = [

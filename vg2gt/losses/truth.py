@@ -86,33 +86,21 @@ class ScaleAlignment:
         if self.source not in SCALE_SOURCES:
             raise ValueError(f"loss.align.source must be one of {SCALE_SOURCES}, got {self.source!r}")
 
-    def fit(self, geometry: Geometry, truth: Truth) -> Tensor:
-        """Returns scales ``[B]`` fitted to the context views' decoded depth; 1 in scenes without known depth."""
-        shown = truth.views(slice(0, geometry.depth.shape[1]))
-        return _fit(geometry.depth, shown, shown.valid, torch.ones_like(truth.unit))
 
-    def fit_rendered(self, depth: Tensor, hits: Tensor, views: Tensor, truth: Truth, decoded: Tensor) -> Tensor:
-        """Returns scales ``[B]`` fitted to the rendered depth if that is the source, else ``decoded``.
+def fit_scale(depth: Tensor, truth: Truth, valid: Tensor, fallback: Tensor | float = 1.0) -> Tensor:
+    """Fits scales ``[B]`` from decoded or rendered depth to the truth's unit.
 
-        Args:
-            depth: ``[B, R, H, W]`` rendered depth.
-            hits: ``[B, R, H, W]`` bool, which pixels show a surface.
-            views: ``[R]`` indices of the views in the batch.
-            truth: ground truth of all views.
-            decoded: ``[B]`` scales of the decoded depth, also used for scenes where the fit has no pixels.
-        """
-        if self.source != "rendered":
-            return decoded
-        shown = truth.views(views)
-        return _fit(depth, shown, shown.valid & hits, decoded)
+    Args:
+        depth: ``[B, V, H, W]``.
+        truth: ground truth of the same views.
+        valid: ``[B, V, H, W]`` bool, the pixels to fit.
+        fallback: ``[B]`` scales of scenes without known depth or pixels to fit.
+    """
+    scale = fit_depth_scale(depth, truth.depth, valid & truth.known[:, None, None, None])
+    return torch.where(scale.isfinite(), scale, fallback)
 
 
 def to_unit(geometry: Geometry, scale: Tensor) -> Geometry:
     """Converts geometry to another unit, with ``scale`` ``[B]`` new units per old unit."""
     cameras = scale_translations(geometry.cameras, scale)
     return replace(geometry, depth=geometry.depth * scale[:, None, None, None], cameras=cameras)
-
-
-def _fit(depth: Tensor, shown: Truth, valid: Tensor, fallback: Tensor) -> Tensor:
-    scale = fit_depth_scale(depth, shown.depth, valid & shown.known[:, None, None, None])
-    return torch.where(scale.isfinite(), scale, fallback)
