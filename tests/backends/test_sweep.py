@@ -51,22 +51,6 @@ def test_kernels_equal_the_reference(problem) -> None:
             torch.testing.assert_close(kernel, reference, rtol=1e-4, atol=1e-4)
 
 
-def test_similarity_is_highest_on_the_true_plane() -> None:
-    """A textured wall at depth 4, seen from three places: features of the same point match where the plane is right."""
-    poses, intrinsics = row_of_cameras(3)
-    generator = torch.Generator().manual_seed(0)
-    texture = torch.nn.functional.normalize(torch.randn(1, GROUPS, SIZE[0], 64, generator=generator), dim=1)
-    disparity = 20 * 0.2 / 4  # one pixel per view: exact shifts
-    features = torch.cat([texture[..., int(k * disparity) :][..., : SIZE[1]] for k in range(3)])
-    planes = 1 / torch.tensor([2.0, 3.0, 4.0, 6.0, 12.0])
-    warp = SourceWarp(poses, intrinsics, torch.tensor([[1], [2], [1]]), SIZE)
-    inverse = planes[None, :, None].expand(3, -1, SIZE[0] * SIZE[1])
-    similarity, inside = correlate(features, inverse, warp)
-    mean = (similarity.sum(-1) * inside).sum((1, 3)) / inside.sum((1, 3))
-    assert mean.argmax(1).tolist() == [2, 2, 2]
-    torch.testing.assert_close(mean[:, 2], torch.ones(3), rtol=0, atol=1e-4)
-
-
 def test_agreement_is_one_for_true_depth_and_signed_otherwise(make_scene) -> None:
     hints = make_scene(1, 3, SIZE)[1]
     sources = torch.tensor([[1, 2], [0, 2], [0, 1]])
