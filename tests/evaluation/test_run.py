@@ -191,7 +191,7 @@ def test_what_is_missing_or_wrong_is_named(tmp_path: Path, cache: Path, trained:
     for device in ("banana", "cuda:99"):
         with pytest.raises(ValueError, match=f"device={device} is not available"):
             run(tmp_path, cache, f"device={device}")
-    with pytest.raises(FileNotFoundError, match=r"no \.pth or \.safetensors at /nowhere/vgg\.pth"):
+    with pytest.raises(FileNotFoundError, match=r"LPIPS weights not found at /nowhere/vgg\.pth"):
         run(tmp_path, cache, "evaluation.lpips=/nowhere/vgg.pth")
     with pytest.raises(DataError, match=r"has 32 frames .* views=33 needs 33"):
         run(tmp_path, cache, "views=[33]")
