@@ -76,11 +76,9 @@ class DA3MetricBackend(NetworkBackend):
         weights = Weights(name, licence, pretrained, repo, revision, path, seed, prefix, ignorable)
         super().__init__(make, weights, patch_size, dim, taps, head_chunk, is_metric=True, needs_hints=True)
 
-    @torch.no_grad()
-    def encode(self, images: Tensor, hints: Hints | None = None) -> Tokens:
-        """See :meth:`Backend.encode`; computes the scale factors here, so that token changes do not affect them."""
-        self.check_images(images)
-        hints = self.require_hints(images, hints, "cameras")
+    def encode_checked(self, images: Tensor, hints: Hints | None) -> Tokens:
+        """See :meth:`NetworkBackend.encode_checked`; token changes do not affect the scale factors of here."""
+        assert hints is not None
         assert hints.cameras is not None
         with half_precision_on_gpu(images):
             patch, camera = self.network.backbone["pretrained"](normalize_images(images), self.taps)

@@ -64,8 +64,8 @@ class PixelHead(nn.Module):
         self.out = nn.Linear(hidden or in_channels, sum(self.parts))
         nn.init.normal_(self.out.weight, std=0.02)
         nn.init.zeros_(self.out.bias)
-        self.scale_bias = _logit(INITIAL_SCALE / MAX_SCALE)
-        self.opacity_bias = _logit(INITIAL_OPACITY)
+        self.scale_bias = math.log(INITIAL_SCALE / (MAX_SCALE - INITIAL_SCALE))
+        self.opacity_bias = math.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY))
         self.sh_gain: Tensor
         self.register_buffer("sh_gain", harmonic_gains(sh_degree), persistent=False)
 
@@ -204,7 +204,3 @@ def _same_signs(quats: Tensor, confidence: Tensor, plan: VoxelPlan) -> Tensor:
     decisive = pool_mean(quats.detach().square(), confidence.detach(), plan).argmax(-1)
     own = quats.detach().gather(1, decisive[plan.voxel_of.clamp(min=0), None]) if len(plan) else quats[:, :1]
     return torch.where(own < 0, -quats, quats)
-
-
-def _logit(probability: float) -> float:
-    return math.log(probability / (1 - probability))

@@ -62,10 +62,6 @@ def camera_metrics(predicted: Cameras, reference: Cameras) -> dict[str, float]:
     results = {f"rra_{t}": float((rotation < t).double().mean()) for t in ACCURACIES}
     results |= {f"rta_{t}": float((translation < t).double().mean()) for t in ACCURACIES}
     worse = torch.maximum(rotation, translation).flatten()
-    return results | {f"auc_{t}": area_under_curve(worse, t) for t in AREAS}
-
-
-def area_under_curve(errors: Tensor, threshold: int) -> float:
-    """Mean over whole degrees t = 1 .. threshold of the share of errors ``[N]`` below t degrees."""
-    steps = torch.arange(1, threshold + 1, dtype=errors.dtype, device=errors.device)
-    return float((errors[:, None] < steps).double().mean())
+    degrees = torch.arange(1, max(AREAS) + 1, dtype=worse.dtype, device=worse.device)
+    accuracy = (worse[:, None] < degrees).double().mean(0)
+    return results | {f"auc_{t}": float(accuracy[:t].mean()) for t in AREAS}
