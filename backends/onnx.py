@@ -81,9 +81,9 @@ class EncoderGraph(Graph):
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Encodes ``[B, V, 3, H, W]`` images; world-to-camera matrices and intrinsics follow if they are used."""
-        images, *cameras = inputs
-        hints = Hints(cameras=Cameras(*cameras, (images.shape[-2], images.shape[-1]))) if cameras else None
-        tokens = self.backend.encode_checked(images, hints)
+        size = (inputs[0].shape[-2], inputs[0].shape[-1])
+        hints = Hints(cameras=Cameras(inputs[1], inputs[2], size)) if len(inputs) > 1 else None
+        tokens = self.backend.encode_checked(inputs[0], hints)
         return (*(tap.unflatten(2, tokens.grid) for tap in tokens.patch), tokens.camera)
 
 
