@@ -37,7 +37,6 @@ REMEDY = "write it with vg2gt export backend=NAME --out FOLDER"
 DECODERS = {kind.__name__: kind for kind in (VGGTDecoder, DA3Decoder)}  # the only classes that are built from a file
 DECODED = ("depth", "depth_conf", "world_to_camera", "intrinsics")
 CUDA = "CUDAExecutionProvider"
-
 TRACED = (2, 3, 4, 6)  # traced scenes, views, patch rows, patch columns: all different, none 1
 CHECKED = ((1, 1, 3, 2), (1, 2, 2, 5), (2, 4, 3, 3))
 TOLERANCE = 1e-3  # relative error; a correct graph differs by about 1e-6, a wrong one by far more than 1e-3
@@ -81,9 +80,10 @@ class EncoderGraph(Graph):
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Encodes ``[B, V, 3, H, W]`` images; world-to-camera matrices and intrinsics follow if they are used."""
-        size = (inputs[0].shape[-2], inputs[0].shape[-1])
-        hints = Hints(cameras=Cameras(inputs[1], inputs[2], size)) if len(inputs) > 1 else None
-        tokens = self.backend.encode_checked(inputs[0], hints)
+        images, *cameras = inputs
+        size = (images.shape[-2], images.shape[-1])
+        hints = Hints(cameras=Cameras(cameras[0], cameras[1], size)) if cameras else None
+        tokens = self.backend.encode_checked(images, hints)
         return (*(tap.unflatten(2, tokens.grid) for tap in tokens.patch), tokens.camera)
 
 

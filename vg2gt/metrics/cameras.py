@@ -63,5 +63,4 @@ def camera_metrics(predicted: Cameras, reference: Cameras) -> dict[str, float]:
     results |= {f"rta_{t}": float((translation < t).double().mean()) for t in ACCURACIES}
     worse = torch.maximum(rotation, translation).flatten()
     degrees = torch.arange(1, max(AREAS) + 1, dtype=worse.dtype, device=worse.device)
-    accuracy = (worse[:, None] < degrees).double().mean(0)
-    return results | {f"auc_{t}": float(accuracy[:t].mean()) for t in AREAS}
+    return results | {f"auc_{t}": float((worse[:, None] < degrees[:t]).double().mean()) for t in AREAS}
