@@ -2,10 +2,11 @@
 
 Parts, in order of importance: agreement of the kernels with the reference (``selfcheck``), ``pytest -m gpu``
 (``tests``), forward and backward pass of the renderer, and of gsplat if installed (``render``), training steps of
-``experiment=paper`` with random weights, by stage (``step``), nearest neighbours (``knn``), ``reconstruct`` with 50
-images (``reconstruct``), and reading images (``loading``, on the CPU). Every part runs in a separate process with a
-time limit. After every measurement it writes ``<date>-gpu-<part>.json`` to ``--out`` (default: the variable OUT, or
-benchmarks/results), so that partial results are kept. ``--small`` makes all sizes tiny, also for a CPU.
+``experiment=paper`` with random weights, by stage, and the device hours of a training of the paper's length (``step``),
+``reconstruct`` with 50 images (``reconstruct``), and reading images (``loading``, on the CPU). Every part runs in a
+separate process with a time limit. After every measurement it writes ``<date>-gpu-<part>.json`` to ``--out`` (default:
+the variable OUT, or benchmarks/results), so that partial results are kept. ``--small`` makes all sizes tiny, also for a
+CPU.
 """
 
 from __future__ import annotations
@@ -15,24 +16,24 @@ import subprocess
 import sys
 import tempfile
 import time
-import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import torch
-from common import MEGABYTE, dated, machine, parser
+from common import MEGABYTE, dated, machine, parser, prepare, whole_step
 
 from vg2gt.io.files import read_json, write_json
-from vg2gt.profiling import now
+from vg2gt.profiling import listening, now
 
 ROOT = Path(__file__).resolve().parents[1]
 Result = dict[str, Any]
 LINES = 25  # lines of output and profile to keep
+PAPER_STEPS, PAPER_DEVICES = 420_000, 2
 
 
 @dataclass(frozen=True)
@@ -117,47 +118,48 @@ def render(setting: Setting) -> Iterator[Result]:
 
 
 def step(setting: Setting) -> Iterator[Result]:
-    """Training steps of the paper's experiment: time, memory, stages, profile and waits."""
-    from stages import Case
-
+    """Training steps of the paper's experiment: time, memory, stages and profile."""
     if setting.small:
         tiny = ("backend=da3_tiny", "model=tiny", "trainer.precision=bf16-mixed")
-        cases = {"tiny": Case(2, (28, 56), ("experiment=paper", "trainer=gpu", "data=synthetic", *tiny))}
+        cases = {"tiny": (2, (28, 56), tiny)}
     else:
-        paper = ("experiment=paper", "trainer=gpu", "data=synthetic", "backend.pretrained=false")
-        paper = (*paper, "renderer.implementation=triton")  # measure even if the self-check rejects the kernels
+        # measure even if the self-check rejects the kernels
+        random = ("backend.pretrained=false", "renderer.implementation=triton")
+        giant = (15, (224, 448), (*random, "backend=da3_giant"))
         cases = {
-            "da3_large, 8 views": Case(8, (224, 448), (*paper, "backend=da3_large")),
-            "da3_giant, 15 views": Case(15, (224, 448), (*paper, "backend=da3_giant")),
+            "da3_large, 8 views": (8, (224, 448), (*random, "backend=da3_large")),
+            "da3_giant, 15 views": giant,
+            "da3_giant, 15 views, trained too": (*giant[:2], (*giant[2], "backend.freeze=false")),
         }
-    for name, case in cases.items():
-        for found in _step(setting, case):
+    for name, (views, size, overrides) in cases.items():
+        for found in _step(setting, views, size, ("experiment=paper", "trainer=gpu", "data=synthetic", *overrides)):
             yield {f"{name}: {what}": value for what, value in found.items()}
 
 
-def _step(setting: Setting, case: Any) -> Iterator[Result]:
-    from common import whole_step
-    from stage_clock import StageClock
-    from stages import prepare
-
+def _step(setting: Setting, views: int, size: tuple[int, int], overrides: Sequence[str]) -> Iterator[Result]:
     device = setting.device
     setting.forget_peak()
     with tempfile.TemporaryDirectory() as folder:
-        run, batch = prepare(case, device, folder)
-    clock = StageClock(device)
-    whole = partial(whole_step(run, clock.stage), batch.context)
+        run, batch = prepare(views, size, overrides, device, Path(folder))
+    stages: Counter[str] = Counter()
+
+    @contextmanager
+    def stage(name: str) -> Iterator[None]:
+        begin = now(device)
+        yield
+        stages[name] += 1e3 * (now(device) - begin)
+
+    whole = partial(whole_step(run, stage), batch.context)
     milliseconds = setting.timed(whole)
     reserved = torch.cuda.max_memory_reserved(device) / MEGABYTE if device.type == "cuda" else 0.0
-    yield {"step_ms": milliseconds, "peak_mb": setting.peak_mb(), "peak_reserved_mb": reserved}
-    clock.stages.clear()
-    with clock.listening():
+    hours = milliseconds / 3.6e6 * PAPER_STEPS * PAPER_DEVICES
+    memory = {"peak_mb": setting.peak_mb(), "peak_reserved_mb": reserved}
+    yield {"step": {"ms": milliseconds, "device_hours_of_the_paper": hours, **memory}}
+    stages.clear()
+    with listening(stage):
         whole()
-    yield {
-        "stage_ms": {stage: 1e3 * passes.best for stage, passes in clock.stages.items()},
-        "stage_peak_mb": {stage: passes.memory for stage, passes in clock.stages.items()},
-    }
+    yield {"stage_ms": dict(stages)}
     yield {"profile": _profile(device, whole)}
-    yield {"waits": _waits(device, whole)}
 
 
 def _profile(device: torch.device, act: Callable[[], Any]) -> Result:
@@ -185,54 +187,6 @@ def _profile(device: torch.device, act: Callable[[], Any]) -> Result:
         "waits": waits,
         "most": [[row.key[:90], row.count, taken(row)] for row in sorted(of_device, key=taken)[: -LINES - 1 : -1]],
     }
-
-
-def _waits(device: torch.device, act: Callable[[], Any]) -> Result:
-    """Counts waits of the host for the device in one pass, including copies to it, by calling function."""
-    from gpu_waits import Waits, place
-
-    if device.type != "cuda":
-        with Waits() as waits:
-            act()
-        return {"all": waits.total, "places": dict(waits.places.most_common())}
-    places: Counter[str] = Counter()
-
-    def note(message: Any, *_: Any, **__: Any) -> None:
-        if "synchroniz" in str(message):
-            places[place(sys._getframe(1))] += 1
-
-    with warnings.catch_warnings(), mock.patch.object(warnings, "showwarning", note):
-        warnings.simplefilter("always")
-        torch.cuda.set_sync_debug_mode("warn")
-        try:
-            act()
-        finally:
-            torch.cuda.set_sync_debug_mode("default")
-    return {"all": places.total(), "places": dict(places.most_common())}
-
-
-def knn(setting: Setting) -> Iterator[Result]:
-    """Nearest-neighbour search: 16 voxels for every patch point, and 4 points (with itself) for every pixel."""
-    from vg2gt.kernels.cell_search import nearest_by_cells
-
-    for name, views, step, neighbors in (("patch points", 18, 7, 16), ("pixels", 10, 1, 4)):
-        height, width = (14, 28) if setting.small else (224, 448)
-        rows, columns = torch.meshgrid(torch.arange(0, height, step), torch.arange(0, width, step), indexing="ij")
-        depth = 2 + torch.sin(columns / 60) + torch.cos(rows / 50)
-        u, v = (columns - width / 2) / width * depth, (rows - height / 2) / width * depth
-        points = torch.cat([torch.stack((u + 0.1 * n, v + 0.01 * n, depth), -1).view(-1, 3) for n in range(views)])
-        points = (points / 0.01).float().to(setting.device)
-        found_in = points if neighbors == 4 else torch.unique(points.floor(), dim=0) + 0.5
-        zeros = torch.zeros(len(points), dtype=torch.int64, device=setting.device)
-        setting.forget_peak()
-
-        def search(
-            points: torch.Tensor = points, found_in: torch.Tensor = found_in, k: int = neighbors,
-            zeros: torch.Tensor = zeros,
-        ) -> None:  # fmt: skip
-            nearest_by_cells(points, zeros, found_in, zeros[: len(found_in)], k, 1)
-
-        yield {name: {"queries": len(points), "ms": setting.timed(search), "peak_mb": setting.peak_mb()}}
 
 
 def reconstruct(setting: Setting) -> Iterator[Result]:
@@ -299,8 +253,7 @@ PARTS = {
     "selfcheck": Part(selfcheck, 90),
     "tests": Part(tests, 210),
     "render": Part(render, 90),
-    "step": Part(step, 150),
-    "knn": Part(knn, 45),
+    "step": Part(step, 180),
     "reconstruct": Part(reconstruct, 75),
     "loading": Part(loading, 30),
 }

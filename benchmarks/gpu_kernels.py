@@ -23,7 +23,7 @@ from unittest import mock
 import torch
 import triton  # pyright: ignore[reportMissingImports]
 from common import machine, parser, write_results
-from render_scene import room_cameras, room_gaussians
+from render import room_cameras, room_gaussians
 from torch import Tensor
 from triton import knobs  # pyright: ignore[reportMissingImports]
 from triton.backends.compiler import GPUTarget  # pyright: ignore[reportMissingImports]

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from common import MEGABYTE, PeakMemory, machine, parser, write_results
+from common import MEGABYTE, machine, parser, write_results
 from hydra.utils import instantiate
 from opensplat import BACKGROUND, train
 from photo_sets import PhotoSet, prepare
@@ -120,13 +120,14 @@ def ours(
         budgets: core-seconds.
         size: longer side of the images to reconstruct from; None uses the scored size.
     """
-    photos, memory = scores.photos, PeakMemory(torch.device("cpu"))
+    photos = scores.photos
+    restart_peak_memory()
     began = time.process_time()
     scene = reconstruct_with(loaded.model, photos.folder, size=size or photos.size, renderer=loaded.renderer)
     taken = time.process_time() - began
 
     def scored(label: str, scene: Scene, seconds: float, steps: int) -> Row:
-        used = {"core_seconds": seconds, "peak_memory_mb": memory.peak / MEGABYTE, "steps": steps}
+        used = {"core_seconds": seconds, "peak_memory_mb": peak_memory() / MEGABYTE, "steps": steps}
         return {**used, **scores(label, scene.gaussians, given_cameras(scene, photos), scene.renderer)}
 
     rows = [{"budget": FEED_FORWARD, **scored(FEED_FORWARD, scene, taken, 0)}]
@@ -134,7 +135,7 @@ def ours(
         if budget <= taken:
             print(f"{photos.name}: budget {budget:g} skipped, {taken:.0f} core-seconds passed before refinement")
             continue
-        memory.restart()
+        restart_peak_memory()
         began = time.process_time()
         options = replace(refinement, steps=None, seconds=budget - taken)
         refined = refine_scene(scene, options, clock=time.process_time)
@@ -142,6 +143,17 @@ def ours(
         assert refined.refined is not None
         rows.append({"budget": budget, **scored(_budget(budget), refined, seconds, refined.refined.steps)})
     return rows
+
+
+def restart_peak_memory() -> None:
+    """Resets what :func:`peak_memory` returns to the memory in use."""
+    Path("/proc/self/clear_refs").write_text("5")
+
+
+def peak_memory() -> int:
+    """Returns the largest resident memory of this process in bytes."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmHWM:"))
 
 
 def peer(binary: Path, scores: Scores, extra: Sequence[str], budgets: Sequence[float]) -> list[Row]:

@@ -1,11 +1,13 @@
 """What a training step of the paper's model asks of a GPU, counted on the CPU."""
 
+from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from tests.gpu_counts import as_on_a_gpu, count_step
 from tests.training_helpers import NARROW
 
 # At fe8e252, counted alike: 20,262 and a render of 8 views in plain torch, which every fresh run took there.
@@ -14,11 +16,11 @@ WAITS = 40
 
 
 def test_operations_and_waits_of_a_training_step(benchmark_script, tmp_path: Path) -> None:
-    stages = benchmark_script("stages")
+    common = benchmark_script("common")
     tiny = ("backend=da3_tiny", "backend.pretrained=false", "trainer.precision=bf16-mixed", *NARROW)
-    case = stages.Case(2, (28, 56), ("experiment=paper", "data=synthetic", *tiny))
-    run, batch = stages.prepare(case, torch.device("cpu"), str(tmp_path))
-    operations, waits = benchmark_script("gpu_waits").count_step(run, batch.context)
+    overrides = ("experiment=paper", "data=synthetic", *tiny)
+    run, batch = common.prepare(2, (28, 56), overrides, torch.device("cpu"), tmp_path)
+    operations, waits = count_step(partial(common.whole_step(run), batch.context))
     assert 0 < waits.total() <= WAITS, waits.most_common()
     assert 5_000 < operations.total() <= 8_500 < BEFORE / 3, operations.most_common(30)
 
@@ -48,10 +50,8 @@ class FloatProducts(TorchDispatchMode):
     ],
 )
 def test_a_step_on_a_gpu_multiplies_no_integer_matrices(options, size, benchmark_script, tmp_path: Path) -> None:
-    stages = benchmark_script("stages")
-    case = stages.Case(2, size, (*options, "data=synthetic"))
-    run, batch = stages.prepare(case, torch.device("cpu"), str(tmp_path))
-    with benchmark_script("gpu_waits").as_on_a_gpu(), FloatProducts() as mode:
-        whole_step = benchmark_script("common").whole_step(run)
-        whole_step(batch.context)
+    common = benchmark_script("common")
+    run, batch = common.prepare(2, size, (*options, "data=synthetic"), torch.device("cpu"), tmp_path)
+    with as_on_a_gpu(), FloatProducts() as mode:
+        common.whole_step(run)(batch.context)
     assert mode.products > 100

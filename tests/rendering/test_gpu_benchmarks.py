@@ -6,6 +6,7 @@ import os
 import pytest
 import torch
 
+from tests.gpu_counts import Operations, Waits
 from vg2gt.rendering import Renderer
 from vg2gt.rendering.options import RenderOptions
 from vg2gt.types import Cameras, Gaussians
@@ -18,14 +19,13 @@ if os.environ.get("TRITON_INTERPRET") == "1":
 
 def count_step(benchmark_script, views: int) -> tuple[int, int, int]:
     """Launches, torch operations and waits of a forward and backward pass with colour, depth and normals."""
-    kernels, counters = benchmark_script("gpu_kernels"), benchmark_script("gpu_waits")
-    scene = benchmark_script("render_scene")
+    kernels, scene = benchmark_script("gpu_kernels"), benchmark_script("render")
     gaussians, cameras = scene.room_gaussians(400, (224, 448)), scene.room_cameras(views, (224, 448))
     gaussians = gaussians.map(lambda t: t.requires_grad_() if t.is_floating_point() else t)
-    with kernels.recorded() as launches, counters.Waits() as waits, counters.Operations() as operations:
+    with kernels.recorded() as launches, Waits() as waits, Operations() as operations:
         out = Renderer(implementation="triton")(gaussians, cameras)
         (out.color.sum() + out.depth.sum() + out.normal.sum()).backward()
-    return len(launches), operations.total, waits.total
+    return len(launches), operations.places.total(), waits.places.total()
 
 
 def test_a_step_is_a_few_launches_and_one_wait_whatever_the_views(benchmark_script) -> None:

@@ -54,7 +54,7 @@ def compare(page: Page, path: Path, gaussians: Gaussians, cameras: Cameras) -> l
 
 @pytest.mark.parametrize(("size", "count"), [((240, 320), 25_000), ((480, 640), 140_000)])
 def test_screenshot_is_our_rasterized_image_of_a_room(page, tmp_path, size, count, benchmark_script):
-    room = benchmark_script("render_scene")
+    room = benchmark_script("render")
     gaussians, cameras = room.room_gaussians(count, size, sigma=2.0), room.room_cameras(12, size)
     path = tmp_path / f"room-{len(gaussians)}.html"
     figures = compare(page, path, gaussians, cameras.select(slice(0, 12, 4)))

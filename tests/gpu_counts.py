@@ -1,16 +1,12 @@
-"""Counts GPU synchronisations without a GPU: ``python benchmarks/gpu_waits.py [--views N] [overrides]``.
+"""Counts what a step asks of a GPU, on a CPU: operations, and waits of the host for a value from the device.
 
-A wait is a synchronisation because the host needs a value from the device: a number, or a data-dependent shape. Runs a
-reconstruction and a training step on the CPU, with the model of the overrides. Counts the torch operations that would
-wait on CUDA, by calling function, and for the training step also all operations. The counts of waits are lower bounds:
-operations that wait twice internally count once (except ``bincount``), and copies to the device are not counted. Prints
-tables and writes a dated JSON file.
+Counts of waits are lower bounds: operations that wait twice internally count once (except ``bincount``), and copies to
+the device are not counted.
 """
 
 from __future__ import annotations
 
 import sys
-import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -36,21 +32,12 @@ PACKAGE = "vg2gt"
 
 
 class Waits(TorchDispatchMode):
-    """Counts waits inside its block.
-
-    Attributes:
-        places: counts by the innermost calling function of the package, such as ``method/grid.py plan_voxels``.
-    """
+    """Counts waits inside its block, by the innermost calling function, such as ``method/grid.py plan_voxels``."""
 
     def __init__(self) -> None:
         super().__init__()
         self.places: Counter[str] = Counter()
         self._reading = False
-
-    @property
-    def total(self) -> int:
-        """Total number of waits."""
-        return self.places.total()
 
     def __enter__(self) -> Waits:
         read = Tensor.tolist
@@ -95,7 +82,7 @@ def _waits(name: str, args: Any, kwargs: Any) -> int:
 
 
 def place(frame: FrameType | None) -> str:
-    """Returns the innermost function of the package in the call stack of a frame."""
+    """The innermost function of the package in the call stack of a frame."""
     while frame is not None:
         parts = Path(frame.f_code.co_filename).parts
         if PACKAGE in parts:
@@ -107,21 +94,12 @@ def place(frame: FrameType | None) -> str:
 
 
 class Operations(TorchDispatchMode):
-    """Counts torch operations inside its block, except views, by calling function.
-
-    Args:
-        muted: returns whether to ignore the current operation.
-    """
+    """Counts torch operations inside its block, except views and where ``muted()``, by calling function."""
 
     def __init__(self, muted: Callable[[], bool] = lambda: False) -> None:
         super().__init__()
         self.places: Counter[str] = Counter()
         self.muted = muted
-
-    @property
-    def total(self) -> int:
-        """Total number of operations."""
-        return self.places.total()
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         if not func.is_view and not self.muted():
@@ -157,13 +135,8 @@ def as_on_a_gpu() -> Iterator[None]:
 RENDER = Counter({"the renderer's operations and kernels": 33})
 
 
-def count_step(run: Any, batch: Any) -> tuple[Counter[str], Counter[str]]:
-    """Counts operations and waits of a whole training step on a GPU: forward, backward, clipping, optimiser.
-
-    The renderer counts as ``RENDER`` and one wait, and Hilbert codes as one kernel each.
-    """
-    from common import whole_step
-
+def count_step(step: Callable[[], Any]) -> tuple[Counter[str], Counter[str]]:
+    """Operations and waits of a training step on a GPU; the renderer counts as ``RENDER`` and one wait."""
     from vg2gt.kernels import curve_codes
     from vg2gt.profiling import listening
 
@@ -182,49 +155,18 @@ def count_step(run: Any, batch: Any) -> tuple[Counter[str], Counter[str]]:
         with rendering("render"):
             return hilbert(*args)
 
-    whole, operations, waits = whole_step(run), Operations(lambda: quiet[0] > 0), Waits()
+    operations, waits = Operations(lambda: quiet[0] > 0), Waits()
     with as_on_a_gpu(), mock.patch.object(curve_codes, "hilbert_reference", in_one_kernel), listening(rendering):
-        whole(batch)  # warm-up, as some checks run in the first step only
+        step()  # warm-up, as some checks run in the first step only
         codes.clear()
         with operations:
-            whole(batch)
+            step()
         found = operations.places + codes + RENDER
         with waits:
-            whole(batch)
+            step()
     # Shuffled orders are drawn on the CPU, without a wait.
     asked = {
         where: n for where, n in waits.places.items() if not where.startswith(("rendering/", "types.py Gaussians"))
     }
     asked.pop("method/ptv3.py Level.__init__", None)
     return found, Counter({**asked, "rendering/gpu_tiles.py _list": 1})
-
-
-def main() -> None:
-    """Counts, prints and writes."""
-    from common import parser, write_results
-    from stages import Case, prepare
-
-    from vg2gt.evaluation.tables import print_table
-
-    options = parser(__doc__, overrides="Hydra overrides, such as model=vg2gt")
-    options.add_argument("--views", type=int, default=4)
-    options.add_argument("--size", type=int, nargs=2, default=[112, 224])
-    arguments = options.parse_args()
-    case = Case(arguments.views, tuple(arguments.size), tuple(arguments.overrides))
-    with tempfile.TemporaryDirectory() as folder:
-        run, batch = prepare(case, torch.device("cpu"), folder)
-        context, model = batch.context, run.module.model
-        found: dict[str, Counter[str]] = {}
-        with torch.no_grad(), as_on_a_gpu(), Waits() as waits:
-            model.eval()(context.images, context.hints)
-        found["waits of a reconstruction"] = waits.places
-        found["operations of a training step"], found["waits of a training step"] = count_step(run, batch)
-    for name, places in found.items():
-        rows = [[place, str(count)] for place, count in places.most_common()]
-        print_table(["place", "count"], [*rows, ["all", str(places.total())]], title=name, text_columns=1, width=120)
-    counts = {name: {"all": places.total(), "places": dict(places.most_common())} for name, places in found.items()}
-    write_results(arguments.out, "gpu-waits", {"overrides": arguments.overrides, "views": arguments.views, **counts})
-
-
-if __name__ == "__main__":
-    main()
