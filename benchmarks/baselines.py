@@ -8,24 +8,20 @@ repeated; interrupted ones resume.
 
 ``coarse=PATH`` initialises the coarse modules, and nothing else, from a checkpoint, with
 ``training.coarse_lr_factor=0.3``. ``models=NAME,NAME`` selects models by the names of their folders; ``da3_gs`` (DA3's
-own Gaussians, needs ``backend=da3_giant``) only runs if named. ``shared=FOLDER`` also evaluates on the recordings of
-the reference data, on which no model was trained. Writes runs, ``metrics.json``, ``metrics.md`` and ``models.png`` to
-``outputs/<name>``; default: name=baselines.
+own Gaussians, needs ``backend=da3_giant``) only runs if named. Writes runs, ``metrics.json``, ``metrics.md`` and
+``models.png`` to ``outputs/<name>``; default: name=baselines.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from common import machine
-from hydra.utils import instantiate
 
-from vg2gt.config import compose
-from vg2gt.evaluation.in_training import evaluate_scene
 from vg2gt.evaluation.protocols import ground_truth_target_cameras
 from vg2gt.evaluation.tables import Metric, columns
 from vg2gt.geometry.normals import normals_from_depth
@@ -46,14 +42,8 @@ from vg2gt.studies.study import (
 from vg2gt.training.loop import Run, build
 from vg2gt.types import Batch
 
-DEFAULTS = {"name": "baselines", "steps": "400", "seeds": "1", "coarse": "", "models": "", "shared": ""}
+DEFAULTS = {"name": "baselines", "steps": "400", "seeds": "1", "coarse": "", "models": ""}
 COARSE = "model.coarse."
-# Real scenes that no model here was trained on, with the evaluation protocol of trainings: 8 input views, given poses.
-RECORDINGS = {
-    "HoloLens office": "data=rgbd data.root={shared}/hololens_office_a data.image_size=[112,168]",
-    "7-Scenes kitchen": "data=rgbd data.root={shared}/seven_scenes_redkitchen_a_registered data.image_size=[112,168]"
-    " data.eval_window=19",
-}
 REFERENCE = "VG²GT"
 MAX_ERROR = 0.1  # relative depth error that is shown as white
 COLUMNS = columns(
@@ -64,7 +54,6 @@ COLUMNS = columns(
     "reconstruction_seconds": Metric("all, s", 2, False),
     "render_seconds": Metric("render a view, s", 3, False),
 }
-ON_RECORDINGS = columns("psnr", "ssim", "rmse", "abs_rel", "decoded_abs_rel", "normal_mean", "gaussians")
 
 
 @dataclass(frozen=True)
@@ -145,24 +134,6 @@ def truth(batch: Batch) -> list[torch.Tensor]:
     return [image, colorize_depth(true, near, far), torch.zeros_like(image), colorize_normals(normals)]
 
 
-def evaluation_scenes(overrides: str) -> Iterator[Batch]:
-    """Yields the evaluation scenes, or windows of a recording, of a data configuration."""
-    data = instantiate(compose("train", *overrides.split()).data)
-    data.setup("validate")
-    yield from data.val_dataloader()
-
-
-@torch.no_grad()
-def on_recordings(run: Run, shared: str) -> dict[str, Metrics]:
-    """Evaluates a trained model on each recording; returns means over its windows."""
-    found: dict[str, Metrics] = {}
-    for name, overrides in RECORDINGS.items() if shared else ():
-        scenes = evaluation_scenes(overrides.format(shared=shared))
-        rows = [evaluate_scene(run.module.model, run.module.renderer, scene.to(run.module.device)) for scene in scenes]
-        found[name] = {metric: sum(row[metric] for row in rows) / len(rows) for metric in rows[0]}
-    return found
-
-
 def chosen(names: str) -> dict[str, Model]:
     """Returns the models named by ``models=``, or all that run with any backend; raises SystemExit if unknown."""
     folders = [model.folder for model in MODELS.values()]
@@ -193,22 +164,16 @@ def coarse_start(path: str, home: Path) -> tuple[str, ...]:
 Results = dict[str, dict[int, Metrics]]  # by model and seed
 
 
-def report(results: Results, recordings: Mapping[str, Results], options: Mapping[str, str]) -> str:
-    """Returns the tables as Markdown."""
-
-    def table(found: Results, metrics: Mapping[str, Metric]) -> str:
-        return seeds_table({name: runs for name, runs in found.items() if runs}, metrics)
-
+def report(results: Results, options: Mapping[str, str]) -> str:
+    """Returns the table as Markdown."""
     trained_first = " after a coarse module trained first and alone" if options["coarse"] else ""
     protocol = (
         f"{options['steps']} training steps each, {options['seeds']} seed(s){trained_first} (mean ± 95 % confidence "
         "interval where there are several). Scenes never trained on, held-out views at ground-truth poses, rendered as "
         "stochastic solids, depth aligned by one median scale per scene. Times: best of three passes on one scene."
     )
-    parts = ["# VG²GT and baselines", protocol, table(results, COLUMNS)]
-    for name, found in recordings.items():
-        parts += [f"## {name}, never trained on", table(found, ON_RECORDINGS)]
-    return "\n\n".join(parts) + "\n"
+    table = seeds_table({name: runs for name, runs in results.items() if runs}, COLUMNS)
+    return "\n\n".join(("# VG²GT and baselines", protocol, table)) + "\n"
 
 
 def main() -> None:
@@ -222,7 +187,6 @@ def main() -> None:
     home = Path("outputs").resolve() / options["name"]
     models, begin = chosen(options["models"]), coarse_start(options["coarse"], home)
     results: Results = {name: {} for name in models}
-    recordings: dict[str, Results] = {}
     rows: list[list[torch.Tensor]] = []
     for seed in range(int(options["seeds"])):
         for name, model in models.items():
@@ -233,8 +197,6 @@ def main() -> None:
             metrics = run_once([*mine, *model.overrides], folder)
             run, batch = restore(model, mine, int(steps), folder)
             results[name][seed] = metrics | costs(run, batch)
-            for recording, found in on_recordings(run, options["shared"]).items():
-                recordings.setdefault(recording, {}).setdefault(name, {})[seed] = found
             if seed == 0:
                 rows = rows or [truth(batch)]
                 rows.append(panels(run, batch))
@@ -245,11 +207,10 @@ def main() -> None:
                 "machine": machine(run.module.device),
                 "runs": results,
                 "summary": summarize(results, REFERENCE),
-                "recordings": recordings,
             }
             write_json(home / "metrics.json", content)
-            write_text(home / "metrics.md", report(results, recordings, options))
-    print(report(results, recordings, options))
+            write_text(home / "metrics.md", report(results, options))
+    print(report(results, options))
     print(f"rows of models.png: truth, {', '.join(models)}; colour, depth, relative depth error, normals")
     print(f"metrics: {home / 'metrics.json'}")
 

@@ -1,8 +1,8 @@
 """Compiles every Triton kernel of the renderer, without a GPU: ``python benchmarks/gpu_kernels.py``.
 
 Renders small scenes with the kernels replaced by recorders, and compiles each recorded launch, with its types and
-compile-time options, to machine code for several targets. Prints registers, shared memory, spills and the number of
-instructions. Needs no GPU and no driver, as Triton's wheel includes the assembler. Writes a dated JSON file.
+compile-time options, to machine code for several targets. Prints registers, shared memory and spills. Needs no GPU and
+no driver, as Triton's wheel includes the assembler. Writes a dated JSON file.
 """
 
 from __future__ import annotations
@@ -96,7 +96,6 @@ class Compiled:
         registers: registers per thread.
         shared: bytes of shared memory per program.
         spills: bytes of spilled registers per thread.
-        instructions: number of machine instructions, over all paths.
     """
 
     variant: str
@@ -105,7 +104,6 @@ class Compiled:
     registers: int
     shared: int
     spills: int
-    instructions: int
 
 
 def _type(name: str, value: Any, constants: dict[str, Any]) -> str:
@@ -172,7 +170,10 @@ def variants() -> dict[str, Launch]:
 
 def compile_for(launch: Launch, target: str) -> Compiled:
     """Compiles a recorded launch to machine code and reads its resources."""
-    source = _source(launch)
+    signature = launch.signature
+    pointers = [index for index, kind in enumerate(signature.values()) if kind.startswith("*")]
+    aligned = {(index,): [["tt.divisibility", 16]] for index in pointers}
+    source = triton.compiler.ASTSource(getattr(kernels, launch.kernel), signature, launch.constants, aligned)
     options = {"num_warps": 4, **launch.options}
     warps = options["num_warps"]
     with warnings.catch_warnings():
@@ -181,45 +182,26 @@ def compile_for(launch: Launch, target: str) -> Compiled:
     if TARGETS[target].backend == "hip":
         return _amd(launch, target, warps, made)
     registers, spills = _resources(made.asm["cubin"])
-    return Compiled(launch.variant, target, warps, registers, made.metadata.shared, spills, _count(made.asm["cubin"]))
-
-
-def _source(launch: Launch) -> Any:
-    signature = launch.signature
-    aligned = {
-        (index,): [["tt.divisibility", 16]] for index, kind in enumerate(signature.values()) if kind.startswith("*")
-    }
-    return triton.compiler.ASTSource(getattr(kernels, launch.kernel), signature, launch.constants, aligned)
+    return Compiled(launch.variant, target, warps, registers, made.metadata.shared, spills)
 
 
 def _resources(cubin: bytes) -> tuple[int, int]:
     """Registers, and bytes of stack (used only for spills by Triton's kernels), of an Nvidia program."""
-    said = _tool("cuobjdump", cubin, "-res-usage")
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "kernel.cubin"
+        path.write_bytes(cubin)
+        command = [knobs.nvidia.cuobjdump.path, "-res-usage", str(path)]
+        said = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     (registers,), (stack,), (local,) = (re.findall(rf"{word}:(\d+)", said) for word in ("REG", "STACK", "LOCAL"))
     return int(registers), int(stack) + int(local)
 
 
-def _count(cubin: bytes) -> int:
-    return len(re.findall(r"^\s+/\*[0-9a-f]{4,}\*/\s+(?!NOP|\.)\S", _tool("nvdisasm", cubin), re.M))
-
-
-def _tool(name: str, cubin: bytes, *options: str) -> str:
-    program = getattr(knobs.nvidia, name).path
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "kernel.cubin"
-        path.write_bytes(cubin)
-        return subprocess.run([program, *options, str(path)], check=True, capture_output=True, text=True).stdout
-
-
 def _amd(launch: Launch, target: str, warps: int, made: Any) -> Compiled:
-    text = made.asm["amdgcn"]
-
     def value(name: str) -> int:
-        return int(re.findall(rf"\.{name}:\s+(\d+)", text)[0])
+        return int(re.findall(rf"\.{name}:\s+(\d+)", made.asm["amdgcn"])[0])
 
     spills = 4 * value("vgpr_spill_count") + 4 * value("sgpr_spill_count")
-    instructions = len(re.findall(r"^\t[sv]_|^\t(?:ds|global|buffer|flat)_", text, re.M))
-    return Compiled(launch.variant, target, warps, value("vgpr_count"), made.metadata.shared, spills, instructions)
+    return Compiled(launch.variant, target, warps, value("vgpr_count"), made.metadata.shared, spills)
 
 
 def main() -> None:
@@ -232,7 +214,7 @@ def main() -> None:
     for number, (launch, target) in enumerate(wanted, start=1):
         print(f"{number}/{len(wanted)} {launch.variant} for {target}", flush=True)  # some take a minute
         found.append(compile_for(launch, target))
-    head = ["kernel", "target", "warps", "registers", "shared", "spilled bytes", "instructions"]
+    head = ["kernel", "target", "warps", "registers", "shared", "spilled bytes"]
     print_table(head, [[str(value) for value in asdict(row).values()] for row in found], text_columns=2, width=120)
     rows = [asdict(row) for row in found]
     write_results(arguments.out, "gpu-kernels", {"machine": machine(), "triton": triton.__version__, "kernels": rows})

@@ -14,6 +14,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -118,24 +119,18 @@ class Clock(Monitor):
         yield show
 
 
-def _halves(times: list[float]) -> float:
-    middle = len(times) // 2
-    return round(sum(times[-middle:]) / sum(times[:middle]), 3)
-
-
 def score(scene: Scene, folder: Path, numbers: set[int] | None = None) -> dict[int, float]:
     """Returns the PSNR of held-out frames by number; the scene must be in the recording's world frame."""
     source = RGBDFolder(str(folder / "held"), holdout=None)
-    name = source.scenes[0]
+    (name,) = source.scenes
+    index, camera = source.scene_index(name), replace(scene.named_cameras()[0], photo=None)
     found = {}
-    for frame in source.frames(name):
-        number = int(source.scene_index(name).color[source.scene_index(name).row(frame)].stem)
+    for row, frame in enumerate(index.frame_ids):
+        number = int(index.color[row].stem)
         if numbers is not None and number not in numbers:
             continue
         loaded = source.load_whole(name, frame)
-        camera = scene.named_cameras()[0]
-        pose = source.scene_index(name).world_to_camera[source.scene_index(name).row(frame)]
-        camera = type(camera)(**{**vars(camera), "world_to_camera": pose, "photo": None})
+        camera = replace(camera, world_to_camera=index.world_to_camera[row])
         (view,) = render_views(scene.renderer, scene.gaussians, [camera])
         found[number] = float(psnr(view.color[None], loaded.images[:1])[0])
     return found
@@ -161,7 +156,11 @@ def run(folder: Path, window: int, overrides: list[str]) -> None:
         "peak_mib": round(clock.peak_memory_mib),
         "core_seconds": round(total, 1),
         "seconds": {name: round(sum(times), 1) for name, times in clock.steps.items()},
-        "second_half_over_first": {name: _halves(times) for name, times in clock.steps.items() if len(times) > 9},
+        "second_half_over_first": {
+            name: round(sum(times[-(len(times) // 2) :]) / sum(times[: len(times) // 2]), 3)
+            for name, times in clock.steps.items()
+            if len(times) > 9
+        },
         "psnr": round(float(np.mean(list(scores.values()))), 3),
         "scores": {str(number): round(value, 3) for number, value in scores.items()},
     }
@@ -181,11 +180,8 @@ def alone(folder: Path, rooms: int, frames: int, chosen: list[int], overrides: l
         )
         scores = score(scene, folder, set(inside))
         ours = np.mean([whole[number] for number in scores])
-        print(
-            json.dumps(
-                {"room": room, "alone": round(float(np.mean(list(scores.values()))), 3), "walk": round(float(ours), 3)}
-            )
-        )
+        theirs = np.mean(list(scores.values()))
+        print(json.dumps({"room": room, "alone": round(float(theirs), 3), "walk": round(float(ours), 3)}))
 
 
 def main() -> None:

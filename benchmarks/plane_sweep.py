@@ -29,15 +29,13 @@ from vg2gt.config import compose
 from vg2gt.geometry.cameras import resize_intrinsics
 from vg2gt.types import Batch, Hints
 
-WORLDS = f"hydra.searchpath=[{Path(__file__).parents[1] / 'examples/worlds/configs'}] "
+MADE = " data.eval_scenes={scenes} data.val.first_seed={seed} data.image_size=[112,224]"
+WORLDS = f"hydra.searchpath=[{Path(__file__).parents[1] / 'examples/worlds/configs'}] data=worlds" + MADE
 SETS = {
-    "rooms": "data=synthetic data.eval_scenes={scenes} data.val.first_seed={seed} data.image_size=[112,224]",
-    "outdoors": WORLDS + "data=worlds data.eval_scenes={scenes} data.val.first_seed={seed} data.image_size=[112,224]"
-    " data.variant=outdoor",
-    "objects": WORLDS + "data=worlds data.eval_scenes={scenes} data.val.first_seed={seed} data.image_size=[112,224]"
-    " data.variant=object",
-    "wide rooms": WORLDS + "data=worlds data.eval_scenes={scenes} data.val.first_seed={seed} data.image_size=[112,224]"
-    " data.variant=wide",
+    "rooms": "data=synthetic" + MADE,
+    "outdoors": WORLDS + " data.variant=outdoor",
+    "objects": WORLDS + " data.variant=object",
+    "wide rooms": WORLDS + " data.variant=wide",
     "HoloLens office": "data=rgbd data.root={shared}/hololens_office_a data.image_size=[112,224]",
     "7-Scenes kitchen": "data=rgbd data.root={shared}/seven_scenes_redkitchen_a_registered data.image_size=[112,224]"
     " data.eval_window=10",

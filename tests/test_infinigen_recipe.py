@@ -1,7 +1,6 @@
 """The Infinigen recipe without Infinigen: camera paths in a box, the check of a room, resuming."""
 
 import argparse
-import csv
 import importlib
 import json
 from pathlib import Path
@@ -84,7 +83,7 @@ def test_a_room_without_space_is_an_error(recipe):
 
 
 def test_ten_rooms_are_held_out_two_of_each_kind(recipe):
-    rooms = recipe("rooms")
+    rooms = recipe("make")
     kinds = [rooms.kind(seed) for seed in rooms.HELD_OUT]
     assert len(set(rooms.HELD_OUT)) == 10
     assert max(rooms.HELD_OUT) < 40
@@ -183,9 +182,6 @@ def test_rooms_are_made_in_stages_that_resume(recipe, tmp_path):
     with pytest.raises(SystemExit, match="another process is making rooms in"):
         make.Rooms(out, interpreter, args)
     del held
-    rows = list(csv.DictReader((out / "log.csv").open()))
-    assert [row["result"] for row in rows if row["room"] == "room_0000"] == ["ok", "exit 1", "ok", "ok"]
-    assert all(float(row["wall_seconds"]) >= 0 for row in rows)
 
 
 def test_every_path_becomes_a_scene(recipe, tmp_path):

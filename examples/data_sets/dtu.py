@@ -30,14 +30,9 @@ from vg2gt.io.images import open_image
 
 EVALUATION_SCANS = (24, 37, 40, 55, 63, 65, 69, 83, 97, 105, 106, 110, 114, 118, 122)
 """The fifteen scans used to evaluate surface reconstruction."""
-SPARSE_VIEWS = (23, 24, 33)
-"""Frame ids of the three-view protocol, numbered from 0 as in the file names."""
-MILLIMETRE = 1e-3
-FULL_SIZE = (1200, 1600)
-"""Height and width of the recorded images."""
-MASK_THRESHOLD = 10
-"""Pixels have depth only where ``depth_visual`` is brighter than this."""
-
+_MILLIMETRE = 1e-3
+_FULL_SIZE = (1200, 1600)  # height and width of the recorded images
+_MASK_THRESHOLD = 10  # pixels have depth only where depth_visual is brighter than this
 _QUARTER = 4
 
 
@@ -105,8 +100,7 @@ class DTUTraining(FileSource):
         size = first_size(color, scene)
         reduced = (root / "Cameras" / "train").is_dir()
         poses, intrinsics = _read_cameras(root / "Cameras" / ("train" if reduced else "."), scene, color)
-        bring = _from_quarter if reduced else _from_full
-        intrinsics = {number: bring(matrix, size) for number, matrix in intrinsics.items()}
+        intrinsics = {number: _of_images(matrix, size, reduced) for number, matrix in intrinsics.items()}
         return make_index(scene, folder, color, depth, poses, intrinsics)
 
     def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
@@ -189,7 +183,7 @@ class DTU(FileSource):
         if self.depth == "pfm":
             return _registered(_masked_depth(path, index.name), size, path, index.name)
         pose, matrix = index.world_to_camera[row], index.intrinsics[row]
-        return self._scan_depth.read(path, index.name, pose, matrix, size, MILLIMETRE)
+        return self._scan_depth.read(path, index.name, pose, matrix, size, _MILLIMETRE)
 
     def _depth_place(self, scene: str) -> Path:
         number = _scan_number(scene)
@@ -199,15 +193,10 @@ class DTU(FileSource):
         return self.depth_root / (f"stl{number:03d}_total.ply" if self.depth == "scan" else f"scan{number}")
 
 
-def read_camera(path: Path, scene: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Reads an MVSNet camera file: ``extrinsic`` (4x4 world-to-camera in mm), ``intrinsic`` (3x3) and a depth range.
+def _read_camera(path: Path, scene: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Camera-to-world pose in metres and intrinsics as stored, from an MVSNet camera file.
 
-    Returns:
-        Camera-to-world pose ``[4, 4]`` in metres, and intrinsics ``[3, 3]`` as stored, for the image size that the file
-        was made for.
-
-    Raises:
-        DataError: if the file is missing or damaged, or its transform is not rigid.
+    It has ``extrinsic`` (4x4 world-to-camera in mm), ``intrinsic`` (3x3) and a depth range.
     """
     words = " ".join(read_text_lines(path, scene)).split()
     try:
@@ -218,7 +207,7 @@ def read_camera(path: Path, scene: str) -> tuple[NDArray[np.float64], NDArray[np
     except (ValueError, IndexError) as error:
         raise DataError(f"{path} of scene {scene} is not a camera of MVSNet: {error}") from error
     check_intrinsics(intrinsics, f"{path} of scene {scene}")
-    pose[:3, 3] *= MILLIMETRE
+    pose[:3, 3] *= _MILLIMETRE
     return to_world(pose, f"{path} of scene {scene}"), intrinsics
 
 
@@ -227,29 +216,20 @@ def _read_cameras(
 ) -> tuple[dict[int, NDArray[np.float64]], dict[int, NDArray[np.float64]]]:
     """Camera-to-world poses and intrinsics by frame number, for the wanted frames or all."""
     files = numbered(folder, scene, "*_cam.txt", (".txt",))
-    cameras = {i: read_camera(path, scene) for i, path in files.items() if wanted is None or i in wanted}
+    cameras = {i: _read_camera(path, scene) for i, path in files.items() if wanted is None or i in wanted}
     return {i: pose for i, (pose, _) in cameras.items()}, {i: matrix for i, (_, matrix) in cameras.items()}
 
 
-def _from_quarter(intrinsics: NDArray[np.float64], size: Size) -> NDArray[np.float64]:
-    """Converts intrinsics of MVSNet's 160x128 depth maps to its 640x512 images.
+def _of_images(intrinsics: NDArray[np.float64], size: Size, reduced: bool) -> NDArray[np.float64]:
+    """Converts intrinsics to the images, which are the recorded 1600x1200 images, halved and centre-cropped.
 
-    The principal point in the file is ``(c / 2 - crop) / 4``, with c of the recorded image, which ignores pixel
-    centres: in the coordinates of the halved image, it must be shifted by -1/4 pixel.
+    Reduced ones are for depth maps of 160x128, with the principal point ``(c / 2 - crop) / 4``, where c is that of the
+    recorded image, which ignores pixel centres: in the halved image, it must be shifted by -1/4 pixel.
     """
-    return _scaled(intrinsics, _QUARTER, (-0.25, -0.25))
-
-
-def _from_full(intrinsics: NDArray[np.float64], size: Size) -> NDArray[np.float64]:
-    """Converts intrinsics of the recorded 1600x1200 images to the images, which are halved and centre-cropped."""
-    top, left = ((full // 2 - part) // 2 for full, part in zip(FULL_SIZE, size, strict=True))
-    return _scaled(intrinsics, 0.5, (-0.25 - left, -0.25 - top))
-
-
-def _scaled(intrinsics: NDArray[np.float64], scale: float, shift: tuple[float, float]) -> NDArray[np.float64]:
+    top, left = (0 if reduced else (full // 2 - part) // 2 for full, part in zip(_FULL_SIZE, size, strict=True))
     out = intrinsics.copy()
-    out[:2] *= scale
-    out[:2, 2] += shift
+    out[:2] *= _QUARTER if reduced else 0.5
+    out[:2, 2] -= (0.25 + left, 0.25 + top)
     return out
 
 
@@ -265,8 +245,8 @@ def _masked_depth(path: Path, scene: str) -> NDArray[np.float32]:
     if depth.dtype != np.float32 or depth.ndim != 2:
         raise DataError(f"{path} of scene {scene} is not a one-channel PFM image: it has {depth.dtype} {depth.shape}")
     mask = read_depth(path.with_name(path.stem.replace("depth_map", "depth_visual") + ".png"), scene, depth.shape)
-    valid = (mask > MASK_THRESHOLD) & np.isfinite(depth) & (depth > 0)
-    return np.where(valid, depth, 0) * np.float32(MILLIMETRE)
+    valid = (mask > _MASK_THRESHOLD) & np.isfinite(depth) & (depth > 0)
+    return np.where(valid, depth, 0) * np.float32(_MILLIMETRE)
 
 
 def _registered(depth: NDArray[np.float32], size: Size, path: Path, scene: str) -> NDArray[np.float32]:

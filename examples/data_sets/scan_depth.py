@@ -19,8 +19,7 @@ from vg2gt.io.files import write_cached
 from vg2gt.io.image_files import Size
 from vg2gt.io.ply import read_point_ply
 
-VERSION = 1
-"""Version of the depth computed from a scan, part of the cache key; increment it when the result changes."""
+_VERSION = 2  # part of the cache key; increment it when the result changes
 _CHUNK = 1 << 20  # points projected at a time
 
 
@@ -30,14 +29,9 @@ class ScanDepth:
 
     Args:
         cache: folder for the rendered images; None renders on every read.
-        occlusion: a point is occluded, and dropped, if its depth exceeds this many times the smallest depth in the
-            window around it.
-        window: side of the window in pixels, odd; should exceed the gaps between the points of a near surface.
     """
 
     cache: Path | None = None
-    occlusion: float = 1.03
-    window: int = 7
     _scans: dict[tuple[Path, float], NDArray[np.float32]] = field(default_factory=dict, repr=False, compare=False)
 
     def read(
@@ -65,8 +59,7 @@ class ScanDepth:
         with errors_name(scene):
             state = scan.stat()
         file = (str(scan.resolve()), state.st_mtime_ns, state.st_size, unit)
-        view = (world_to_camera.tolist(), intrinsics.tolist(), size)
-        key = json.dumps([VERSION, file, view, self.occlusion, self.window])
+        key = json.dumps([_VERSION, file, (world_to_camera.tolist(), intrinsics.tolist(), size)])
         name = f"{hashlib.sha256(key.encode()).hexdigest()[:24]}.npz"
         stored = None if self.cache is None else self.cache / "scan-depth" / name
         if stored is not None and stored.is_file():
@@ -76,9 +69,8 @@ class ScanDepth:
                 pass  # damaged: render again
         if (scan, unit) not in self._scans:
             self._scans.clear()  # keep only one scan, as scans are large and scenes are read in sequence
-            self._scans[scan, unit] = read_points(scan, scene) * np.float32(unit)
-        points = self._scans[scan, unit]
-        depth = render_points(points, world_to_camera, intrinsics, size, self.occlusion, self.window)
+            self._scans[scan, unit] = _read_points(scan, scene) * np.float32(unit)
+        depth = render_points(self._scans[scan, unit], world_to_camera, intrinsics, size)
         if stored is not None and self.cache is not None:
             buffer = io.BytesIO()
             np.savez_compressed(buffer, depth=depth)
@@ -86,12 +78,8 @@ class ScanDepth:
         return depth
 
 
-def read_points(path: Path, scene: str) -> NDArray[np.float32]:
-    """Reads the finite vertex positions ``[N, 3]`` of a PLY file.
-
-    Raises:
-        DataError: if the file is missing or damaged, or has no points.
-    """
+def _read_points(path: Path, scene: str) -> NDArray[np.float32]:
+    """Finite vertex positions ``[N, 3]`` of a PLY file."""
     with errors_name(scene), np.errstate(over="ignore", invalid="ignore"):
         points = read_point_ply(path).positions.astype(np.float32)
     points = points[np.isfinite(points).all(1)]
@@ -110,7 +98,9 @@ def render_points(
 ) -> NDArray[np.float32]:
     """Renders the depth ``[H, W]`` of points ``[N, 3]``: the nearest one per pixel unless occluded, 0 without a point.
 
-    Every point covers only the pixel it projects to, so that depth comes from a point less than 0.71 pixels away.
+    Every point covers only the pixel it projects to, so that depth comes from a point less than 0.71 pixels away. A
+    point is occluded if its depth exceeds ``occlusion`` times the smallest depth in the window of ``window`` pixels (an
+    odd number, more than the gaps between the points of a near surface) around it.
     """
     height, width = size
     nearest = np.full(height * width, np.inf, np.float32)

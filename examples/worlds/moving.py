@@ -21,10 +21,7 @@ class SyntheticMovingRoom(SyntheticRoom):
     """The room of the same seed with an extra chair that glides across the floor, seen from cameras on an arc.
 
     Args:
-        seed: determines the scene, together with the number of frames.
-        num_frames: number of cameras on the path, at least 1.
-        size: image ``(height, width)``.
-        highlights: see ``draw_highlights``; the chair is matt.
+        seed, num_frames, size, highlights: see :class:`~vg2gt.data.synthetic.rooms.SyntheticRoom`; the chair is matt.
         distance: distance between the chair's first and last position in metres, at most 2.
         during: start and end of the motion, from 0 (first frame) to 1 (last frame); if equal, the chair jumps.
 

@@ -1,4 +1,4 @@
-"""Object-centred scenes: an object on a bare surface from all around, and landmarks in front of a far background."""
+"""Scenes seen from all around: an object on a bare surface, landmarks in front of a far background, and rooms."""
 
 from __future__ import annotations
 
@@ -8,17 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from examples.worlds import street
-from examples.worlds.outdoor import GROUND_COLORS, draw_daylight
+from examples.worlds.outdoor import GROUND_COLORS, open_world
 from vg2gt.data.synthetic.builder import Builder
 from vg2gt.data.synthetic.furniture import MAKERS
 from vg2gt.data.synthetic.renderer import World
-from vg2gt.data.synthetic.rooms import draw_lamps
+from vg2gt.data.synthetic.rooms import TRIES, SyntheticRoom, draw_lamps
 from vg2gt.data.synthetic.synthetic_scene import SyntheticScene, level_poses
 from vg2gt.data.synthetic.textures import INDOOR, Pattern
 
 _STREAM = 3  # separates the random streams of these scenes from those of other variants with the same seed
 _OPEN_SHARE = 0.4  # probability that an object is outdoors
 _HORIZON = 500.0  # half the extent of an open world in metres
+_OPEN = np.array([[-_HORIZON, -_HORIZON, 0.0], [_HORIZON, _HORIZON, 200.0]])
 _BARE = (Pattern.PLAIN, Pattern.PLAIN, Pattern.CLOUDS, Pattern.WOOD)
 
 
@@ -28,11 +29,7 @@ class SyntheticObject(SyntheticScene):
     The surface is a floor or a table, in a room that may be empty, or outdoors with a far background. Each full orbit
     has a different height and distance. The origin of the world frame is on the floor below the object.
 
-    Args:
-        seed: determines the scene, together with the number of frames.
-        num_frames: number of cameras on the path, at least 1.
-        size: image ``(height, width)``.
-        highlights: see ``draw_highlights``; affects only colours.
+    The arguments are those of :class:`~vg2gt.data.synthetic.rooms.SyntheticRoom`.
     """
 
     version = 1  # increment whenever the same seed would give different pixels
@@ -57,7 +54,7 @@ class SyntheticObject(SyntheticScene):
         farthest = float(np.linalg.norm(position[:, :2], axis=1).max())
         if rng.random() < _OPEN_SHARE:
             _fill_open(builder, farthest + 2.0, 60.0)
-            world = _open_world(builder, floor)
+            world = open_world(builder, floor, _OPEN)
         else:
             half = farthest + rng.uniform(0.8, 4.0, 2)
             high = max(rng.uniform(2.4, 3.6), position[:, 2].max() + 0.4)
@@ -75,11 +72,7 @@ class SyntheticLandmark(SyntheticScene):
     The cameras are on an arc of 60 to 220 degrees around the place, 6 to 40 m away from it, in uneven steps. The origin
     of the world frame is on the ground in the middle of the place.
 
-    Args:
-        seed: determines the scene, together with the number of frames.
-        num_frames: number of cameras on the path, at least 1.
-        size: image ``(height, width)``.
-        highlights: see ``draw_highlights``; affects only colours.
+    The arguments are those of :class:`~vg2gt.data.synthetic.rooms.SyntheticRoom`.
     """
 
     version = 1  # increment whenever the same seed would give different pixels
@@ -98,9 +91,32 @@ class SyntheticLandmark(SyntheticScene):
         height = rng.uniform(1.3, 1.9) + rng.uniform(0, 0.3, num_frames)
         position = np.stack((away * np.cos(along), away * np.sin(along), height), 1)
         _fill_open(builder, float(away.max()) + 8, 0.6 * _HORIZON)
-        world = _open_world(builder, ground)
+        world = open_world(builder, ground, _OPEN)
         poses = _aim(rng, position, np.array([0.0, 0.0, rng.uniform(-1, 3)]), 0.3 * place)
         super().__init__(world, poses, rng.uniform(0.9, 1.4), size, stream, highlights)
+
+
+class SyntheticWideRoom(SyntheticRoom):
+    """The room of the same seed, viewed across from free positions all around (wide baselines)."""
+
+    def _path(
+        self, rng: np.random.Generator, extent: NDArray[np.float64], occupied: NDArray[np.float64], count: int
+    ) -> NDArray[np.float64]:
+        """Camera-to-world poses ``[count, 4, 4]``, ordered by angle around the room's centre."""
+        draws = rng.uniform(-0.5, 0.5, (max(TRIES, 20 * count), 2)) * (extent[:2] - 0.7)
+        gaps = np.linalg.norm(draws[:, None] - occupied[None, :, :2], axis=-1) - occupied[None, :, 2]
+        free = np.argsort(-np.minimum(gaps.min(1, initial=np.inf), 0.2), kind="stable")
+        places = draws[free[: 3 * count]]
+        chosen = [0]  # farthest-point sampling
+        while len(chosen) < count:
+            apart = np.linalg.norm(places[:, None] - places[None, chosen], axis=-1).min(1)
+            chosen.append(int(np.argmax(apart)))
+        places = places[chosen]
+        places = places[np.argsort(np.arctan2(places[:, 1], places[:, 0]))]
+        ahead = rng.normal(0, 0.1, (count, 2)) * extent[:2] - places
+        height = np.minimum(rng.uniform(0.9, 1.8, count), extent[2] - 0.4)
+        pan = np.arctan2(ahead[:, 1], ahead[:, 0]) + rng.normal(0, 0.25, count)
+        return level_poses(np.column_stack((places, height)), pan, rng.uniform(-0.4, 0.05, count))
 
 
 def _bare_material(builder: Builder) -> int:
@@ -214,13 +230,6 @@ def _fill_room(builder: Builder, extent: NDArray[np.float64], free: float) -> No
         builder.place(place, np.arctan2(-place[1], -place[0]) + rng.normal(0, 0.3))
         MAKERS[rng.integers(len(MAKERS))](builder)
     builder.end_group()
-
-
-def _open_world(builder: Builder, ground: int) -> World:
-    lights, ambient, sky = draw_daylight(builder.rng)
-    walls = np.array([[-_HORIZON, -_HORIZON, 0.0], [_HORIZON, _HORIZON, 200.0]])
-    materials = np.full(6, ground)
-    return World(walls=walls, wall_materials=materials, lights=lights, ambient=ambient, sky=sky, **builder.arrays())
 
 
 def _closed_world(builder: Builder, extent: NDArray[np.float64], floor: int) -> World:

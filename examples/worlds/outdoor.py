@@ -48,11 +48,7 @@ class SyntheticOutdoor(SyntheticScene):
 
     The origin of the world frame is on the ground where the camera starts. Depth ranges from about 1 m to 90 m.
 
-    Args:
-        seed: determines the scene, together with the number of frames.
-        num_frames: number of cameras on the path, at least 1.
-        size: image ``(height, width)``.
-        highlights: see ``draw_highlights``; affects only colours.
+    The arguments are those of :class:`~vg2gt.data.synthetic.rooms.SyntheticRoom`.
     """
 
     version = 1  # increment whenever the same seed would give different pixels
@@ -71,7 +67,7 @@ class SyntheticOutdoor(SyntheticScene):
         _close_view(builder, plan)
         _scatter(builder, plan)
         builder.end_group()
-        world = _finish(builder, ground)
+        world = open_world(builder, ground, _BOUNDS)
         super().__init__(world, _camera_path(rng, num_frames), rng.uniform(1.1, 1.5), size, stream, highlights)
 
 
@@ -174,26 +170,23 @@ def _scatter(builder: Builder, plan: _Plan) -> None:
         make(builder)
 
 
-def draw_daylight(rng: np.random.Generator) -> tuple[NDArray[np.float64], float, NDArray[np.float64]]:
-    """Draws the light of a sun ``[1, 6]``, the ambient light and the sky ``[SKY_COLUMNS]``."""
+def open_world(builder: Builder, ground: int, bounds: NDArray[np.float64]) -> World:
+    """Finishes a world under a sky with a sun.
+
+    Args:
+        builder: what stands in it.
+        ground: material of the ground.
+        bounds: lower and upper corner ``[2, 3]`` in metres; beyond these, everything is sky.
+    """
+    rng = builder.rng
     height, turn = rng.uniform(0.4, 1.1), rng.uniform(0, 2 * np.pi)
     sun = np.array([np.cos(height) * np.cos(turn), np.cos(height) * np.sin(turn), np.sin(height)])
     color = rng.uniform(0.85, 1.25) * np.array([1.0, rng.uniform(0.88, 0.97), rng.uniform(0.7, 0.92)])
     color *= 0.5 + 0.25 * _SUN_DISTANCE**2  # cancels the fall-off with distance
-    light = np.concatenate((_SUN_DISTANCE * sun, color))[None]
-    return light, float(rng.uniform(0.35, 0.55)), draw_sky(rng, sun)
-
-
-def _finish(builder: Builder, ground: int) -> World:
-    lights, ambient, sky = draw_daylight(builder.rng)
-    return World(
-        walls=_BOUNDS,
-        wall_materials=np.full(6, ground),
-        lights=lights,
-        ambient=ambient,
-        sky=sky,
-        **builder.arrays(),
-    )
+    lights = np.concatenate((_SUN_DISTANCE * sun, color))[None]
+    ambient = float(rng.uniform(0.35, 0.55))
+    materials = np.full(6, ground)
+    return World(bounds, materials, lights=lights, ambient=ambient, sky=draw_sky(rng, sun), **builder.arrays())
 
 
 def _camera_path(rng: np.random.Generator, count: int) -> NDArray[np.float64]:

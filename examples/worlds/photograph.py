@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,19 +30,13 @@ class Photograph:
     """
 
     exposure: float = 0.0
-    jpeg: tuple[int, int] | None = None
+    jpeg: tuple[int, ...] | None = None
 
     def __post_init__(self) -> None:
         if self.exposure < 0:
             raise ValueError(f"exposure is a standard deviation in stops, at least 0; got {self.exposure}")
         if self.jpeg is not None and not (len(self.jpeg) == 2 and 1 <= self.jpeg[0] <= self.jpeg[1] <= 100):
             raise ValueError(f"jpeg must be null or a range of qualities within [1, 100]; got {list(self.jpeg)}")
-
-    @classmethod
-    def of(cls, exposure: float, jpeg: Sequence[int] | None) -> Photograph | None:
-        """Creates a ``Photograph`` from options; None if they change nothing."""
-        made = cls(float(exposure), None if jpeg is None else tuple(int(quality) for quality in jpeg))  # pyright: ignore
-        return None if made == cls() else made
 
     @property
     def name(self) -> str:

@@ -4,15 +4,14 @@ Makes one room after another on one thread: about 15 core-minutes for a room, an
 after an interruption, run the same command again; finished rooms and views are kept. Needs only the standard library;
 Infinigen and Blender are installed into an environment of their own (``OUT/environment``, or ``--env``).
 
-Results: ``OUT/train/room_NNNN`` and ``OUT/held_out/room_NNNN``, folders for ``data=infinigen``; ``OUT/log.csv``, the
-time of every stage. A room that fails leaves ``OUT/work/room_NNNN/failed.txt`` and is skipped from then on. A room that
-does not pass the check goes to ``OUT/rejected``.
+Results: ``OUT/train/room_NNNN`` and ``OUT/held_out/room_NNNN``, folders for ``data=infinigen``. A room that fails
+leaves ``OUT/work/room_NNNN/failed.txt`` and is skipped from then on. A room that does not pass the check goes to
+``OUT/rejected``.
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
 import fcntl
 import json
 import os
@@ -20,14 +19,21 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from rooms import kind, name, part
-
 HERE = Path(__file__).resolve().parent
 INFINIGEN, BLENDER = "infinigen==1.15.5", "bpy==4.2.0"
+# Infinigen's name of a kind of room, and prefix of the names of its floors.
+KINDS = {
+    "DiningRoom": "dining-room",
+    "LivingRoom": "living-room",
+    "Bedroom": "bedroom",
+    "Kitchen": "kitchen",
+    "Bathroom": "bathroom",
+}
+HELD_OUT = (3, 7, 10, 14, 16, 24, 28, 30, 32, 36)
+"""Seeds excluded from training: two rooms of each kind among the first forty."""
 _THREADS = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "MKL", "OPENBLAS", "NUMBA")}
 # No landscape outside, fewer steps than in fast_solve.gin (100 and 40), and small objects on only four pieces of
 # furniture, as placing them takes most of the time.
@@ -36,11 +42,20 @@ _FASTER = (
     "compose_indoors.solve_steps_large=60", "compose_indoors.solve_steps_medium=25",
     "restrict_solving.solve_max_parent_obj=4",
 )  # fmt: skip
-_COLUMNS = ("room", "seed", "kind", "stage", "result", "wall_seconds", "core_seconds", "peak_gigabytes", "ended")
 
 
 class StageError(Exception):
     """A stage of a room failed."""
+
+
+def kind(seed: int) -> str:
+    """Returns Infinigen's name of the kind of room for a seed; kinds alternate."""
+    return list(KINDS)[seed % len(KINDS)]
+
+
+def part(seed: int) -> str:
+    """Returns the folder name of a room's split."""
+    return "held_out" if seed in HELD_OUT else "train"
 
 
 def make_environment(env: Path, python: str) -> Path:
@@ -109,7 +124,7 @@ class Rooms:
 
     def make(self, seed: int) -> None:
         """Makes one room, unless it exists or failed before."""
-        room = name(seed)
+        room = f"room_{seed:04d}"
         work = self.out / "work" / room
         if any((self.out / place / room).exists() for place in (part(seed), "rejected")):
             return
@@ -120,7 +135,7 @@ class Rooms:
         try:
             if not (work / "coarse").exists():
                 self._coarse(seed, work)
-            self._views(seed, work)
+            self._views(seed, room, work)
         except StageError as error:
             (work / "failed.txt").write_text(f"{error}\n")
             print(f"{room} failed: {error}", flush=True)
@@ -133,54 +148,38 @@ class Rooms:
             "-g", "fast_solve.gin", "singleroom.gin", "-p", *_FASTER,
             f'restrict_solving.restrict_parent_rooms=["{kind(seed)}"]',
         ]  # fmt: skip
-        self._stage(seed, "coarse", command, work / "coarse.log")
+        self._stage("coarse", command, work / "coarse.log")
         if not (new / "scene.blend").exists():
             raise StageError(f"coarse wrote no scene.blend; see {work / 'coarse.log'}")
         new.rename(work / "coarse")
 
-    def _views(self, seed: int, work: Path) -> None:
+    def _views(self, seed: int, room: str, work: Path) -> None:
         args, views = self.args, work / "views"
         command = [
             HERE / "views.py", work / "coarse" / "scene.blend", views, "--seed", seed, "--kind", kind(seed),
             "--views", args.views, "--size", *args.size, "--samples", args.samples,
         ]  # fmt: skip
-        self._stage(seed, "views", command, work / "views.log")
+        self._stage("views", command, work / "views.log")
         log = work / "check.json"
-        self._stage(seed, "check", [HERE / "check.py", views], log)
+        self._stage("check", [HERE / "check.py", views], log)
         figures = json.loads(log.read_text().splitlines()[-1])
         (views / "check.json").write_text(json.dumps(figures | {"seed": seed, "kind": kind(seed)}) + "\n")
-        print(f"{name(seed)} ({kind(seed)}): {figures}", flush=True)
+        print(f"{room} ({kind(seed)}): {figures}", flush=True)
         place = self.out / (part(seed) if figures["ok"] else "rejected")
         place.mkdir(exist_ok=True)
-        views.rename(place / name(seed))
+        views.rename(place / room)
         if not args.keep_blend:
             shutil.rmtree(work / "coarse")
 
-    def _stage(self, seed: int, stage: str, command: Sequence[object], log: Path) -> None:
-        """Runs one stage in Infinigen's environment and adds a row to ``log.csv``."""
-        begun = time.monotonic()
+    def _stage(self, stage: str, command: Sequence[object], log: Path) -> None:
+        """Runs one stage in Infinigen's environment."""
         with log.open("w") as file:
-            process = subprocess.Popen(
+            ended = subprocess.run(
                 [str(self.interpreter), *map(str, command)],
                 cwd=self.links, env={**os.environ, **_THREADS}, stdout=file, stderr=subprocess.STDOUT,
             )  # fmt: skip
-            try:
-                _, status, usage = os.wait4(process.pid, 0)
-            except BaseException:
-                process.terminate()
-                raise
-        process.returncode = os.waitstatus_to_exitcode(status)
-        result = "ok" if process.returncode == 0 else f"exit {process.returncode}"
-        row = (name(seed), seed, kind(seed), stage, result, round(time.monotonic() - begun, 1),
-               round(usage.ru_utime + usage.ru_stime, 1), round(usage.ru_maxrss / 2**20, 2),
-               time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()))  # fmt: skip
-        path = self.out / "log.csv"
-        is_new = not path.exists()
-        with path.open("a", newline="") as file:
-            writer = csv.writer(file)
-            writer.writerows([_COLUMNS, row] if is_new else [row])
-        if process.returncode:
-            raise StageError(f"{stage}: {result}; see {log}")
+        if ended.returncode:
+            raise StageError(f"{stage}: exit {ended.returncode}; see {log}")
 
 
 def main() -> None:
@@ -196,13 +195,12 @@ def main() -> None:
     parser.add_argument("--keep-blend", action="store_true", help="keep every room's scene.blend (400 to 500 MB)")
     parser.add_argument("--env", type=Path, help="folder of Infinigen's environment (3 GB)")
     parser.add_argument("--python", default="python3.11", help="interpreter that the environment is made with")
-    parser.add_argument("--first", type=int, nargs="*", default=[], metavar="SEED", help="seeds to begin with")
     args = parser.parse_args()
     out = args.out.resolve()
     out.mkdir(parents=True, exist_ok=True)
     interpreter = make_environment((args.env or out / "environment").resolve(), args.python)
     rooms = Rooms(out, interpreter, args)
-    for seed in dict.fromkeys([*args.first, *range(args.rooms)]):
+    for seed in range(args.rooms):
         rooms.make(seed)
 
 

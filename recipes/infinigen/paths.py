@@ -5,7 +5,7 @@ Paths query a ``Space`` for free space and visibility, so they do not need Blend
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Protocol
@@ -24,17 +24,11 @@ SHARES = {"walk": 12, "turn": 8, "orbit_near": 12, "orbit_far": 12, "near": 8, "
 
 
 class Space(Protocol):
-    """Geometry of a room.
+    """Geometry of a room."""
 
-    Attributes:
-        low: lower corner of the room's bounding box ``[3]``; z is the floor.
-        high: upper corner ``[3]``; z is the ceiling.
-        objects: centre and radius of the objects to look at ``[n, 4]``.
-    """
-
-    low: Vector
-    high: Vector
-    objects: Vector
+    low: Vector  # lower corner of the bounding box [3]; z is the floor
+    high: Vector  # upper corner [3]; z is the ceiling
+    objects: Vector  # centre and radius of the objects to look at [n, 4]
 
     def inside(self, point: Vector) -> bool:
         """Returns whether a point is above the room's own floor."""
@@ -184,7 +178,6 @@ def _walk(space: Space, rng: np.random.Generator, count: int, field_of_view: flo
     """A straight walk with bobbing and a slow pan, in steps of 8 to 25 cm."""
 
     def draw() -> _Path:
-        """Tries once; empty if there is no space."""
         start, end = _stand(space, rng), _stand(space, rng)
         if start is None or end is None or np.linalg.norm(end - start) < 0.8:
             return []
@@ -208,7 +201,6 @@ def _turn(space: Space, rng: np.random.Generator, count: int, field_of_view: flo
     """A turn on the spot in steps of 10 to 35 degrees, with the camera 5 to 35 cm from the axis."""
 
     def draw() -> _Path:
-        """Tries once; empty if there is no space."""
         stand = _stand(space, rng, 0.4)
         if stand is None:
             return []
@@ -230,7 +222,6 @@ def _orbit(near: bool, space: Space, rng: np.random.Generator, count: int, field
     """An orbit around an object in steps of 10 to 40 degrees; positions that are not free are skipped."""
 
     def draw() -> _Path:
-        """Tries once; empty if there is no space."""
         *center, size = space.objects[rng.integers(len(space.objects))]
         target = np.array(center)
         distance = size + (rng.uniform(0.35, 0.9) if near else rng.uniform(1.0, 2.5))
@@ -255,7 +246,6 @@ def _near(space: Space, rng: np.random.Generator, count: int, field_of_view: flo
     """A sideways pass in front of an object, at 30 to 70 cm."""
 
     def draw() -> _Path:
-        """Tries once; empty if there is no space."""
         *center, size = space.objects[rng.integers(len(space.objects))]
         target = np.array(center)
         away = _look(rng.uniform(0, 2 * np.pi), rng.uniform(0.0, 0.9))
@@ -293,7 +283,7 @@ def _far(space: Space, rng: np.random.Generator, count: int, field_of_view: floa
     return path
 
 
-_PATHS: dict[str, Callable[[Space, np.random.Generator, int, float], Sequence[tuple[Vector, Vector]]]] = {
+_PATHS: dict[str, Callable[[Space, np.random.Generator, int, float], _Path]] = {
     "walk": _walk,
     "turn": _turn,
     "orbit_near": partial(_orbit, True),

@@ -16,7 +16,6 @@ import math
 import os
 import tempfile
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +25,10 @@ import bpy  # noqa: E402
 
 os.sched_setaffinity(0, _cores)
 import numpy as np  # noqa: E402
+from make import KINDS  # noqa: E402
 from mathutils import Matrix, Vector  # noqa: E402
 from paths import View, plan  # noqa: E402
 from PIL import Image  # noqa: E402
-from rooms import KINDS  # noqa: E402
 
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # from OpenCV camera axes to Blender's
 _SKY = 1e4  # metres; Blender's depth of the sky is 1e10
@@ -58,7 +57,7 @@ class Room:
             raise SystemExit(f"the scene has no floor of a {kind}")
         things = [_thing(item) for item in meshes if "Factory" in item.name and not any(x in item.name for x in _FIXED)]
         spheres = np.array([thing for thing in things if _THINGS[0] < thing[3] < _THINGS[1]]).reshape(-1, 4)
-        inside = {floor.name: self._above(floor, spheres) for floor in floors}
+        inside = {floor.name: np.array([self._is_above(floor, x[:3]) for x in spheres], bool) for floor in floors}
         self._floor = max(floors, key=lambda floor: inside[floor.name].sum())
         self.objects = spheres[inside[self._floor.name]]
         corners = _corners(self._floor)
@@ -67,9 +66,6 @@ class Room:
         middle = Vector((*((self.low + self.high)[:2] / 2), self.low[2] + 0.1))
         ceilings = [item for item in meshes if item.name == self._floor.name.replace(".floor", ".ceiling")]
         self.high[2] = _corners(ceilings[0])[:, 2].min() if ceilings else middle.z + 2.5
-
-    def _above(self, floor: Any, points: np.ndarray) -> np.ndarray:
-        return np.array([self._is_above(floor, point[:3]) for point in points], bool)
 
     def _is_above(self, floor: Any, point: np.ndarray) -> bool:
         to_floor = floor.matrix_world.inverted()
@@ -214,19 +210,10 @@ def _planned(out: Path, kind: str, seed: int, count: int) -> list[View]:
         {"path": v.path, "position": v.position.tolist(), "forward": v.forward.tolist(), "roll": v.roll,
          "fov": v.field_of_view} for v in views
     ]  # fmt: skip
-    _write_text(path, json.dumps(rows))
-    return views
-
-
-def _write_text(path: Path, text: str) -> None:
-    new = path.with_name(path.name + ".new")
-    new.write_text(text)
+    new = path.with_name("views.json.new")
+    new.write_text(json.dumps(rows))
     os.replace(new, path)
-
-
-def _by_path(views: list[View]) -> Iterator[list[tuple[int, View]]]:
-    for name in dict.fromkeys(view.path for view in views):
-        yield [(i, view) for i, view in enumerate(views) if view.path == name]
+    return views
 
 
 def _write_view(out: Path, index: int, view: View, renderer: Renderer, exposure: float) -> None:
@@ -265,8 +252,9 @@ def main() -> None:
     views = _planned(args.out, args.kind, args.seed, args.views)
     print(f"{len(views)} views planned after {time.process_time() - started:.0f} core seconds", flush=True)
     renderer = Renderer(tuple(args.size), args.samples)
-    for path in _by_path(views):
-        cameras = args.out / "frames" / "camview" / "camera_0"
+    cameras = args.out / "frames" / "camview" / "camera_0"
+    for name in dict.fromkeys(view.path for view in views):
+        path = [(i, view) for i, view in enumerate(views) if view.path == name]
         left = [(i, view) for i, view in path if not (cameras / f"camview_0_0_{i:04d}_0.npz").exists()]
         if not left:
             continue

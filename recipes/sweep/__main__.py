@@ -20,7 +20,6 @@ from torch.utils.data import DataLoader, Subset
 from recipes.sweep.module import SweepTraining
 from recipes.sweep.samples import TrainingSamples
 from recipes.sweep.scenes import make_scenes, read_infinigen
-from recipes.sweep.weights import begin_with, newest_checkpoint, start_step, write_weights
 
 
 @hydra.main(config_path=".", config_name="train", version_base="1.3")
@@ -36,15 +35,16 @@ def main(config: DictConfig) -> None:
         files.append(path)
         if number % 50 == 0 or number == scenes.count:
             print(f"scenes: {number} of {scenes.count}", flush=True)
-    checkpoint = newest_checkpoint(out) if config.resume == "auto" else config.resume
+    newest = max(out.glob("*.ckpt"), key=lambda path: path.stat().st_mtime, default=None)
+    checkpoint = newest if config.resume == "auto" else config.resume
     training: SweepTraining = hydra.utils.instantiate(config.training)
-    first = start_step(checkpoint) if checkpoint else 0
+    first = torch.load(checkpoint, "cpu", weights_only=True, mmap=True)["global_step"] if checkpoint else 0
     rooms = read_infinigen(config.infinigen.folder, config.scenes.folder) if config.infinigen.folder else []
     count = training.steps * config.processes
     every = TrainingSamples(files, count, config.seed, rooms, config.infinigen.share, **config.samples)
     samples = Subset(every, range(first * config.processes, len(every)))
     if config.begin and not checkpoint:
-        begin_with(training, Path(config.begin))
+        training.begin_with(Path(config.begin))
     if checkpoint:
         print(f"resuming {checkpoint} at step {first} of {training.steps}", flush=True)
     keep = ModelCheckpoint(
@@ -64,7 +64,7 @@ def main(config: DictConfig) -> None:
     workers = {"num_workers": config.workers, "pin_memory": config.accelerator == "gpu"}
     trainer.fit(training, DataLoader(samples, batch_size=None, **workers), ckpt_path=checkpoint, weights_only=True)
     if trainer.is_global_zero:
-        print(write_weights(training, out / "sweep.safetensors", config, len(rooms)))
+        print(training.write_weights(out / "sweep.safetensors", config, len(rooms)))
 
 
 if __name__ == "__main__":

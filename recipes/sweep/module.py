@@ -1,13 +1,15 @@
-"""Lightning module that trains the plane sweep."""
+"""Lightning module that trains the plane sweep, and the weight file that it writes."""
 
 from __future__ import annotations
 
 import math
-import time
+from pathlib import Path
 from typing import Any
 
 import lightning
 import torch
+from omegaconf import DictConfig
+from safetensors.torch import load_file, save
 from torch import Tensor
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
@@ -15,6 +17,7 @@ from backends.sweep.network import PosedViews, SweepEncoding, SweepNet
 from recipes.sweep.objective import objective
 from recipes.sweep.samples import Sample
 from vg2gt.geometry.precision import full_precision
+from vg2gt.io.files import write_bytes
 
 _LARGEST_GRADIENT = 1.0
 
@@ -53,8 +56,12 @@ class SweepTraining(lightning.LightningModule):
         self.net.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
         self.averaged = AveragedModel(self.net, multi_avg_fn=get_ema_multi_avg_fn(average))
         self.averaged.requires_grad_(False)
-        self._core_seconds = 0.0  # of earlier processes, minus the time used by this one before training
-        self._processes = 1
+
+    def begin_with(self, path: Path) -> None:
+        """Loads initial weights into the network and its average."""
+        state = load_file(path)
+        for net in (self.net, self.averaged.module):
+            net.load_state_dict(state)
 
     def training_step(self, sample: Sample, index: int) -> Tensor:
         """Returns the objective of one sample; raises RuntimeError if it is not finite."""
@@ -93,29 +100,30 @@ class SweepTraining(lightning.LightningModule):
         scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, self._relative_rate)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
-    @property
-    def core_seconds(self) -> float:
-        """CPU time of the whole training in seconds, over all processes and resumed runs."""
-        return self._core_seconds + self._processes * time.process_time()
-
-    def count_from(self, core_seconds: float) -> None:
-        """Sets the CPU time that the initial weights have cost."""
-        self._core_seconds = core_seconds
-
-    def on_train_start(self) -> None:
-        """Starts counting CPU time."""
-        self._processes = self.trainer.world_size
-        self._core_seconds -= self._processes * time.process_time()
-
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Stores the CPU time."""
-        checkpoint["core_seconds"] = self.core_seconds
-
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Restores the CPU time."""
-        self._core_seconds = float(checkpoint.get("core_seconds", 0.0))
-
     def _relative_rate(self, step: int) -> float:
         begin = (1 - self.cooldown) * self.steps
         fall = min(max((step - begin) / max(self.steps - begin, 1), 0.0), 1.0)
         return min(1.0, (step + 1) / self.warmup) * (0.02 + 0.98 * (0.5 + 0.5 * math.cos(math.pi * fall)))
+
+    def write_weights(self, path: Path, config: DictConfig, rooms: int) -> Path:
+        """Writes the averaged weights in half precision, with a summary of the training in the header.
+
+        Args:
+            path: output safetensors file.
+            config: configuration of the training.
+            rooms: number of Infinigen rooms among its scenes.
+
+        Returns:
+            ``path``.
+        """
+        state = self.averaged.module.state_dict()
+        tensors = {name: value.detach().half().contiguous() for name, value in sorted(state.items())}
+        made_of = {
+            "steps": str(self.global_step),
+            "scenes": f"{config.scenes.count} from seed {config.scenes.first_seed}, {rooms} Infinigen rooms",
+            "seed": str(config.seed),
+            "begun_with": Path(config.begin).name if config.begin else "random weights",
+            "device": torch.cuda.get_device_name() if config.accelerator == "gpu" else "cpu",
+        }
+        write_bytes(path, save(tensors, metadata=made_of))
+        return path

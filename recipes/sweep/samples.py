@@ -23,10 +23,8 @@ from vg2gt.types import Cameras
 
 _UPRIGHT_SHARE = 0.3  # of samples rotated by 90 degrees to portrait format
 _CUT_SHARE = 0.25  # of samples whose planes do not cover the whole depth of the scene
-_CUT, _CUT_INDOORS = (
-    (0.5, 0.98),
-    (0.85, 0.98),
-)  # range of the depth quantile at which they end; higher indoors, where walls are near
+# Range of the depth quantile at which they end; higher indoors, where walls are near.
+_CUT, _CUT_INDOORS = (0.5, 0.98), (0.85, 0.98)
 _LEAST_OVERLAP = 0.15
 _WALK_FRAMES, _WALK_STEP = 14, math.radians(9)  # maximum frames and median rotation between frames of a walk
 _PLANES = (32, 48)  # few sizes, as convolutions on CPUs are compiled for each
@@ -121,16 +119,9 @@ class TrainingSamples(Dataset[Sample]):
             int(rng.choice(_SOURCES, p=_SOURCE_SHARES)),
         )
         parts = [self._scene(layout, rng) for _ in range(self.scenes)]
-        return Sample(
-            torch.cat([part.images for part in parts]),
-            torch.cat([part.depth for part in parts]),
-            torch.cat([part.world_to_camera for part in parts]),
-            torch.cat([part.intrinsics for part in parts]),
-            torch.cat([part.depth_range for part in parts]),
-            torch.cat([part.sources + n * self.views for n, part in enumerate(parts)]),
-            layout.planes,
-            self.scenes,
-        )
+        parts = [part._replace(sources=part.sources + n * self.views) for n, part in enumerate(parts)]
+        joined = [torch.cat(tensors) for tensors in zip(*(part[:6] for part in parts), strict=True)]
+        return Sample(*joined, layout.planes, self.scenes)
 
     def _scene(self, layout: Layout, rng: Generator) -> Sample:
         while True:
@@ -238,25 +229,21 @@ def _finish(views: _Crop, valid: Tensor, cut: tuple[float, float], layout: Layou
     unit = math.exp(rng.normal(0, 0.5))  # random unit, so that the network cannot rely on it
     poses, depth = views.world_to_camera.clone(), views.depth * unit
     poses[:, :3, 3] *= unit
-    low, middle, high = (
-        float(unit * torch.quantile(valid[:: max(len(valid) // 4000, 1)], q)) for q in (0.01, 0.5, 0.99)
-    )
+    some = valid[:: max(len(valid) // 4000, 1)]
+    low, middle, high = (float(unit * torch.quantile(some, q)) for q in (0.01, 0.5, 0.99))
     if rng.random() < _CUT_SHARE:  # as when structure from motion finds no points in the background
-        high = float(unit * torch.quantile(valid[:: max(len(valid) // 4000, 1)], rng.uniform(*cut)))
+        high = float(unit * torch.quantile(some, rng.uniform(*cut)))
     near = low * math.exp(-(rng.uniform(0.02, 0.5) if rng.random() < 0.75 else rng.uniform(0, 1.8)))
     far = high * math.exp(rng.uniform(0, 0.6) if rng.random() < 0.75 else rng.uniform(0, 2.5))
     if rng.random() < _POSE_SHARE:
-        poses = _pose_noise(len(poses), min(middle, 3 * low), rng) @ poses
+        turns = torch.from_numpy(rng.normal(0, _TURN, (len(poses), 3))).float()
+        shifts = torch.from_numpy(rng.normal(0, _SHIFT * min(middle, 3 * low), (len(poses), 3))).float()
+        poses = rigid_motions(turns, shifts) @ poses
     depth_range, size = torch.tensor([near, far]), (depth.shape[-2], depth.shape[-1])
     noise = torch.from_numpy(rng.normal(0, _SOURCE_NOISE, (len(poses), len(poses)))).float()
     sources = choose_sources(poses, views.intrinsics, size, depth_range, layout.sources, noise)
     look = recolour(views.images, rng)
     return Sample(look, depth, poses, views.intrinsics, depth_range.expand(len(poses), 2), sources, layout.planes)
-
-
-def _pose_noise(views: int, depth: float, rng: Generator) -> Tensor:
-    turns = torch.from_numpy(rng.normal(0, _TURN, (views, 3))).float()
-    return rigid_motions(turns, torch.from_numpy(rng.normal(0, _SHIFT * depth, (views, 3))).float())
 
 
 def recolour(images: Tensor, rng: Generator) -> Tensor:

@@ -50,11 +50,6 @@ class SceneFrames(NamedTuple):
     intrinsics: Tensor
 
 
-def scene_file(folder: Path, seed: int, size: tuple[int, int] = SIZE) -> Path:
-    """Returns the cache file of a seed."""
-    return folder / f"{seed:08d}-{size[0]}x{size[1]}.npz"
-
-
 def is_room(path: Path) -> bool:
     """Returns whether a cached scene is a room."""
     first = path.stem.split("-")[0]
@@ -67,7 +62,7 @@ def read_scene(path: Path) -> SceneFrames:
     return SceneFrames(*(torch.from_numpy(arrays[name]) for name in SceneFrames._fields))
 
 
-def render_scene(seed: int, size: tuple[int, int] = SIZE, threads: int = 1) -> dict[str, NDArray]:
+def render_scene(seed: int, size: tuple[int, int] = SIZE) -> dict[str, NDArray]:
     """Renders a training scene; the seed determines its kind.
 
     The scene is one of :mod:`examples.worlds`. Focal length, roll, camera shake, highlights and photographic flaws are
@@ -76,7 +71,6 @@ def render_scene(seed: int, size: tuple[int, int] = SIZE, threads: int = 1) -> d
     Args:
         seed: seed of the scene.
         size: height and width of the frames.
-        threads: number of threads that render.
 
     Returns:
         The fields of :class:`SceneFrames`, as arrays.
@@ -96,25 +90,13 @@ def render_scene(seed: int, size: tuple[int, int] = SIZE, threads: int = 1) -> d
     photograph = Photograph(_EXPOSURE, _JPEG)
     if rng.random() < 0.67:
         scene.develop = partial(photograph.develop, seed)
-    rendered = scene.render(frames.tolist(), threads, samples=1)
+    rendered = scene.render(frames.tolist(), 1, samples=1)
     depth = np.stack([frame.depth for frame in rendered])
     return {
         "images": np.stack([frame.image for frame in rendered]),
         "depth": np.where(depth > 0, depth, np.inf).astype(np.float16),
         "world_to_camera": scene.world_to_camera[frames].astype(np.float32),
         "intrinsics": np.tile(scene.intrinsics.astype(np.float32), (FRAMES, 1, 1)),
-    }
-
-
-def infinigen_scene(source: Infinigen, scene: str) -> dict[str, NDArray]:
-    """Reads a room of ``recipes/infinigen`` as the same arrays; views through windows count as sky."""
-    frames = source.load(scene, source.frames(scene))
-    depth = frames.depth.numpy()
-    return {
-        "images": (frames.images.permute(0, 2, 3, 1) * 255).round().byte().numpy(),
-        "depth": np.where(depth > 0, depth, np.inf).astype(np.float16),
-        "world_to_camera": frames.world_to_camera.numpy().astype(np.float32),
-        "intrinsics": frames.intrinsics.numpy().astype(np.float32),
     }
 
 
@@ -156,20 +138,31 @@ def make_scenes(
 
 
 def _make_scene(root: Path, size: tuple[int, int], seed: int) -> Path:
-    path = scene_file(root, seed, size)
+    path = root / f"{seed:08d}-{size[0]}x{size[1]}.npz"
     if not path.is_file():
         _write(path, render_scene(seed, size), root)
     return path
 
 
 def read_infinigen(folder: str | os.PathLike[str], cache: str | os.PathLike[str]) -> list[Path]:
-    """Converts all rooms in ``folder`` to files in ``cache`` that load quickly; returns these files."""
+    """Converts all rooms in ``folder`` to files in ``cache`` that load quickly; returns these files.
+
+    Views through windows count as sky.
+    """
     root, paths = Path(cache).expanduser(), []
     source = Infinigen(str(folder))
     for scene in source.scenes:
         path = root / f"infinigen-{scene.replace('/', '-')}.npz"
         if not path.is_file():
-            _write(path, infinigen_scene(source, scene), root)
+            frames = source.load(scene, source.frames(scene))
+            depth = frames.depth.numpy()
+            arrays = {
+                "images": (frames.images.permute(0, 2, 3, 1) * 255).round().byte().numpy(),
+                "depth": np.where(depth > 0, depth, np.inf).astype(np.float16),
+                "world_to_camera": frames.world_to_camera.numpy().astype(np.float32),
+                "intrinsics": frames.intrinsics.numpy().astype(np.float32),
+            }
+            _write(path, arrays, root)
         paths.append(path)
     return paths
 

@@ -16,7 +16,6 @@ from backends.sweep.volume import from_inverse
 from recipes.sweep.objective import cell_inverse, objective
 from recipes.sweep.samples import Sample, TrainingSamples
 from recipes.sweep.scenes import make_scenes, read_infinigen, read_scene
-from recipes.sweep.weights import newest_checkpoint
 from tests.commands import ROOT
 from tests.data.sources import layout_infinigen
 from tests.data.sources.layouts import room
@@ -205,7 +204,6 @@ def test_training_resumes_and_writes_weights(scenes: list[Path], tmp_path: Path)
     saving = ("save_every=1", "training.cooldown=0")
     train(scenes, tmp_path / "whole", 2, *saving)
     train(scenes, tmp_path / "parts", 1, *saving)
-    assert newest_checkpoint(tmp_path / "parts") is not None
     assert "at step 1 of 2" in train(scenes, tmp_path / "parts", 2, *saving)
     nets = [SweepBackend(path=str(tmp_path / part / "sweep.safetensors")).network for part in ("whole", "parts")]
     for a, b in zip(nets[0].parameters(), nets[1].parameters(), strict=True):
@@ -217,7 +215,6 @@ def test_two_processes_and_given_weights(scenes: list[Path], tmp_path: Path) -> 
     """Both processes end on the same weights, which are near those that the training began with."""
     train(scenes, tmp_path, 1, "processes=2", f"begin={SHIPPED}")
     with safe_open(tmp_path / "sweep.safetensors", "pt") as made, safe_open(SHIPPED, "pt") as given:
-        assert float(made.metadata()["core_hours"]) >= float(given.metadata()["core_hours"])
         assert made.metadata()["begun_with"] == SHIPPED.name
         for name in given.keys():  # noqa: SIM118 (no mapping)
             torch.testing.assert_close(made.get_tensor(name), given.get_tensor(name), rtol=0.05, atol=1e-3)

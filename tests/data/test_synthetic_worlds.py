@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from examples.worlds import Worlds
-from examples.worlds.orbits import SyntheticLandmark, SyntheticObject
+from examples.worlds.orbits import SyntheticLandmark, SyntheticObject, SyntheticWideRoom
 from examples.worlds.outdoor import SyntheticOutdoor
-from examples.worlds.wide import SyntheticWideRoom
 from vg2gt.data.synthetic.builder import Builder
 from vg2gt.data.synthetic.raycast import AXES, HALF, KIND, PART_COLUMNS
 from vg2gt.data.synthetic.renderer import World, render_frame

@@ -9,7 +9,7 @@ from tests.commands import ROOT
 from vg2gt.config import compose
 from vg2gt.data import SceneDataModule
 
-from . import layout_infinigen, layout_kitti, layout_replica, layout_scannet, layout_tum
+from . import layout_infinigen, layout_replica, layout_scannet, layout_tum
 from .layouts import room
 
 
@@ -47,18 +47,12 @@ def _replica(root: Path, *scenes: str) -> None:
         layout_replica.write(root, room(), scene)
 
 
-def _virtual_kitti(root: Path, *scenes: str) -> None:
-    for scene in (*scenes, "Scene20/rain/Camera_0"):
-        layout_kitti.write_virtual(root, room(), scene.removesuffix("/Camera_0"))
-
-
 def _tum(root: Path, scene: str, _) -> None:
     layout_tum.write(root, room(), scene)
 
 
 EXAMPLES = ROOT / "examples" / "data_sets" / "configs"
 TUM = "rgbd_dataset_freiburg1_desk"
-DRIVES = [f"{drive}/Camera_0" for drive in ("Scene01/rain", "Scene02/clone", "Scene06/fog", "Scene18/clone")]
 EVERY = "data.every=1"
 SMALL = ["data.image_size=[28,42]", "data.min_views=2", "data.max_views=2", "data.max_images=2", "data.eval_context=2"]
 
@@ -77,7 +71,6 @@ SMALL = ["data.image_size=[28,42]", "data.min_views=2", "data.max_views=2", "dat
             ["office4", "room2"],
             [EVERY, "data.intrinsics=[27,27,19.5,14.5]"],
         ),
-        ("virtual_kitti", _virtual_kitti, DRIVES, ["Scene20/clone/Camera_0"], []),
         ("tum", _tum, [TUM], [TUM], [EVERY]),
     ],
 )

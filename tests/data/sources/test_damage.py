@@ -181,10 +181,6 @@ NAMED: dict[str, list[tuple[str, Callable[[Path], Any], str]]] = {
         ("rgb.txt", put("1.5 rgb/a.png\n1.50 rgb/b.png\n"), r"lists 1\.50 twice"),
         ("groundtruth.txt", put(POSE.replace(" 1\n", " 0\n")), "1 frames whose pose is not finite"),
     ],
-    "virtual_kitti": [
-        ("extrinsic.txt", lines(lambda rows: [*rows, rows[1]]), "has frame 0 of camera 0 twice"),
-        ("intrinsic.txt", lines(lambda rows: [r for r in rows if r.split()[1] != "0"]), "6 frames without a pose"),
-    ],
     "scannetpp_iphone": [
         ("*.npz", arrays(trajectories=np.eye(4)[None]), "trajectories in .* must hold 7x4x4 numbers"),
         ("*.npz", arrays(images=np.array([f"DSC0{i}.JPG" for i in range(7)])), r"names an image 'DSC00.JPG'"),

@@ -7,7 +7,7 @@ import pytest
 import torch
 from PIL import Image
 
-from examples.data_sets.dtu import DTU, EVALUATION_SCANS, DTUTraining, _from_full, _from_quarter, _registered
+from examples.data_sets.dtu import DTU, EVALUATION_SCANS, DTUTraining, _of_images, _registered
 from vg2gt.data import DataError
 from vg2gt.data.transforms import resize
 
@@ -41,8 +41,8 @@ def test_training_cameras_of_both_sizes_give_the_same_intrinsics():
     quarter[:2] *= 0.5
     quarter[:2, 2] -= (80, 44)
     quarter[:2] /= 4
-    images = _from_quarter(quarter, (512, 640))
-    np.testing.assert_allclose(images, _from_full(full, (512, 640)))
+    images = _of_images(quarter, (512, 640), reduced=True)
+    np.testing.assert_allclose(images, _of_images(full, (512, 640), reduced=False))
     np.testing.assert_allclose(images[0], [1446.165, 0, 823.205 / 2 - 80 - 0.25])
 
 
