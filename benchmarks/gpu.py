@@ -241,22 +241,15 @@ def loading(setting: Setting) -> Iterator[Result]:
         yield {"rgbd": {"images_per_core_second": images / (time.process_time() - begin), "images": images}}
 
 
-@dataclass(frozen=True)
-class Part:
-    """A measurement and its time limit in seconds."""
-
-    measure: Callable[[Setting], Iterator[Result]]
-    seconds: int
-
-
-PARTS = {
-    "selfcheck": Part(selfcheck, 90),
-    "tests": Part(tests, 210),
-    "render": Part(render, 90),
-    "step": Part(step, 180),
-    "reconstruct": Part(reconstruct, 75),
-    "loading": Part(loading, 30),
+PARTS: dict[str, tuple[Callable[[Setting], Iterator[Result]], int]] = {
+    "selfcheck": (selfcheck, 90),
+    "tests": (tests, 210),
+    "render": (render, 90),
+    "step": (step, 180),
+    "reconstruct": (reconstruct, 75),
+    "loading": (loading, 30),
 }
+"""Measurements, and their time limits in seconds."""
 
 
 def measure(name: str, setting: Setting, path: Path) -> Result:
@@ -265,7 +258,7 @@ def measure(name: str, setting: Setting, path: Path) -> Result:
     write_json(path, content)
     begin = time.perf_counter()
     try:
-        for found in PARTS[name].measure(setting):
+        for found in PARTS[name][0](setting):
             content["results"] |= found
             content["seconds"] = time.perf_counter() - begin
             write_json(path, content)
@@ -320,7 +313,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         return
     end = time.monotonic() + 60 * arguments.minutes
     for name in arguments.parts:
-        left = min(PARTS[name].seconds, end - time.monotonic())
+        left = min(PARTS[name][1], end - time.monotonic())
         if left < 10:
             print(f"{name}: no time left", flush=True)
             continue

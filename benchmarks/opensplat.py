@@ -67,20 +67,13 @@ def train(
     return run
 
 
-def schedule(steps: int) -> list[str]:
-    """Returns OpenSplat's options for a short training; its defaults are for 30,000 steps."""
-    return [
-        f"--num-iters={steps}",
-        "--num-downscales=0",
-        f"--sh-degree-interval={min(1000, max(1, steps // 4))}",
-        f"--warmup-length={min(500, steps // 5)}",
-    ]
-
-
 def _train(binary: Path, photos: Path, scene: Path, steps: int, extra: Sequence[str]) -> Training:
     scene.unlink(missing_ok=True)
     scene.parent.mkdir(parents=True, exist_ok=True)
-    chosen = {option.partition("=")[0]: option for option in (*schedule(steps), *extra)}
+    # a short training; the defaults are for 30,000 steps
+    short = [f"--num-iters={steps}", "--num-downscales=0", f"--warmup-length={min(500, steps // 5)}"]
+    short.append(f"--sh-degree-interval={min(1000, max(1, steps // 4))}")
+    chosen = {option.partition("=")[0]: option for option in (*short, *extra)}
     command = [str(binary), str(photos), "--cpu", "--keep-crs", f"--output={scene}", *chosen.values()]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment)

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from vg2gt.data.sources.colmap_model import model_folder_of
@@ -109,38 +108,28 @@ def prepare(name: str, photos: Path, out: Path, size: int, patch: int, poses: st
     for index in context:
         write_png(folder / "images" / f"{view_name(index)}.png", views.images[index])
     names = [picture.name for picture in pictures]
-    points = _points(model, titles, [names[index] for index in context])
-    written = _scene(views.hints.cameras.select(torch.tensor(context)), context, points)
+    cameras = views.hints.cameras.select(torch.tensor(context))
+    written = _scene(model, titles, [names[index] for index in context], cameras, context)
     write_colmap(folder / "sparse" / "0", written)
     return PhotoSet(name, folder, views.images, views.hints.cameras, context, held_out, written.num_points3D())
 
 
-@dataclass(frozen=True)
-class SparsePoints:
-    """Points of a COLMAP model that at least two input views see.
+def _scene(
+    folder: Path | None, titles: dict[str, str], names: Sequence[str], cameras: Cameras, context: Sequence[int]
+) -> Reconstruction:
+    """COLMAP model of the input views at the working size, with the points of a model that enough of them see.
 
-    Attributes:
-        positions: ``[N, 3]``.
-        colors: ``[N, 3]``, uint8.
-        sees: whether a view sees a point ``[views, N]``, bool.
+    ``titles`` maps file names in the model of ``folder`` to view names where they differ.
     """
-
-    positions: NDArray[np.float64]
-    colors: NDArray[np.uint8]
-    sees: NDArray[np.bool_]
-
-
-def _points(folder: Path | None, titles: dict[str, str], names: Sequence[str]) -> SparsePoints:
-    """Points seen by the named views; ``titles`` maps file names in the model to view names where they differ."""
-    if folder is None:
-        return SparsePoints(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros((len(names), 0), bool))
-    model = read_colmap(folder)
-    view_of = {
-        image.image_id: names.index(title)
-        for image in model.images.values()
-        if (title := titles.get(image.name, Path(image.name).stem)) in names
-    }
-    points = list(model.points3D.values())
+    points, view_of = [], {}
+    if folder is not None:
+        model = read_colmap(folder)
+        points = list(model.points3D.values())
+        view_of = {
+            image.image_id: names.index(title)
+            for image in model.images.values()
+            if (title := titles.get(image.name, Path(image.name).stem)) in names
+        }
     sees = np.zeros((len(names), len(points)), bool)
     for column, point in enumerate(points):
         rows = [view_of[element.image_id] for element in point.track.elements if element.image_id in view_of]
@@ -148,13 +137,9 @@ def _points(folder: Path | None, titles: dict[str, str], names: Sequence[str]) -
     kept = np.flatnonzero(sees.sum(0) >= FEWEST)
     positions = np.array([points[index].xyz for index in kept]).reshape(-1, 3)
     colors = np.array([points[index].color for index in kept], np.uint8).reshape(-1, 3)
-    return SparsePoints(positions, colors, sees[:, kept])
-
-
-def _scene(cameras: Cameras, context: Sequence[int], points: SparsePoints) -> Reconstruction:
-    """COLMAP model of the input views at the working size, with points and their observations."""
-    view, point = np.nonzero(points.sees)
-    seen = torch.from_numpy(points.positions).float().expand(1, len(context), -1, -1)
+    # where the views see them
+    view, point = np.nonzero(sees[:, kept])
+    seen = torch.from_numpy(positions).float().expand(1, len(context), -1, -1)
     pixels = project(seen, cameras)[0][0].double().numpy()[view, point]
-    names = [f"{view_name(index)}.png" for index in context]
-    return colmap_from_views(cameras, names, points.positions, points.colors, (point, view, pixels))
+    files = [f"{view_name(index)}.png" for index in context]
+    return colmap_from_views(cameras, files, positions, colors, (point, view, pixels))
