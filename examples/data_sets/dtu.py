@@ -30,7 +30,7 @@ from vg2gt.io.images import open_image
 
 EVALUATION_SCANS = (24, 37, 40, 55, 63, 65, 69, 83, 97, 105, 106, 110, 114, 118, 122)
 """The fifteen scans used to evaluate surface reconstruction."""
-_MILLIMETRE = 1e-3
+MILLIMETRE = 1e-3
 _FULL_SIZE = (1200, 1600)  # height and width of the recorded images
 _MASK_THRESHOLD = 10  # pixels have depth only where depth_visual is brighter than this
 _QUARTER = 4
@@ -183,7 +183,7 @@ class DTU(FileSource):
         if self.depth == "pfm":
             return _registered(_masked_depth(path, index.name), size, path, index.name)
         pose, matrix = index.world_to_camera[row], index.intrinsics[row]
-        return self._scan_depth.read(path, index.name, pose, matrix, size, _MILLIMETRE)
+        return self._scan_depth.read(path, index.name, pose, matrix, size, MILLIMETRE)
 
     def _depth_place(self, scene: str) -> Path:
         number = _scan_number(scene)
@@ -207,7 +207,7 @@ def _read_camera(path: Path, scene: str) -> tuple[NDArray[np.float64], NDArray[n
     except (ValueError, IndexError) as error:
         raise DataError(f"{path} of scene {scene} is not a camera of MVSNet: {error}") from error
     check_intrinsics(intrinsics, f"{path} of scene {scene}")
-    pose[:3, 3] *= _MILLIMETRE
+    pose[:3, 3] *= MILLIMETRE
     return to_world(pose, f"{path} of scene {scene}"), intrinsics
 
 
@@ -246,7 +246,7 @@ def _masked_depth(path: Path, scene: str) -> NDArray[np.float32]:
         raise DataError(f"{path} of scene {scene} is not a one-channel PFM image: it has {depth.dtype} {depth.shape}")
     mask = read_depth(path.with_name(path.stem.replace("depth_map", "depth_visual") + ".png"), scene, depth.shape)
     valid = (mask > _MASK_THRESHOLD) & np.isfinite(depth) & (depth > 0)
-    return np.where(valid, depth, 0) * np.float32(_MILLIMETRE)
+    return np.where(valid, depth, 0) * np.float32(MILLIMETRE)
 
 
 def _registered(depth: NDArray[np.float32], size: Size, path: Path, scene: str) -> NDArray[np.float32]:

@@ -69,7 +69,7 @@ class ScanDepth:
                 pass  # damaged: render again
         if (scan, unit) not in self._scans:
             self._scans.clear()  # keep only one scan, as scans are large and scenes are read in sequence
-            self._scans[scan, unit] = _read_points(scan, scene) * np.float32(unit)
+            self._scans[scan, unit] = read_points(scan, scene) * np.float32(unit)
         depth = render_points(self._scans[scan, unit], world_to_camera, intrinsics, size)
         if stored is not None and self.cache is not None:
             buffer = io.BytesIO()
@@ -78,8 +78,12 @@ class ScanDepth:
         return depth
 
 
-def _read_points(path: Path, scene: str) -> NDArray[np.float32]:
-    """Finite vertex positions ``[N, 3]`` of a PLY file."""
+def read_points(path: Path, scene: str) -> NDArray[np.float32]:
+    """Reads the finite vertex positions ``[N, 3]`` of a PLY file.
+
+    Raises:
+        DataError: if the file is missing or damaged, or has no points.
+    """
     with errors_name(scene), np.errstate(over="ignore", invalid="ignore"):
         points = read_point_ply(path).positions.astype(np.float32)
     points = points[np.isfinite(points).all(1)]
