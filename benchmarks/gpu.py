@@ -16,7 +16,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -141,13 +140,13 @@ def _step(setting: Setting, views: int, size: tuple[int, int], overrides: Sequen
     setting.forget_peak()
     with tempfile.TemporaryDirectory() as folder:
         run, batch = prepare(views, size, overrides, device, Path(folder))
-    stages: Counter[str] = Counter()
+    stages: dict[str, float] = {}
 
     @contextmanager
     def stage(name: str) -> Iterator[None]:
         begin = now(device)
         yield
-        stages[name] += 1e3 * (now(device) - begin)
+        stages[name] = stages.get(name, 0.0) + 1e3 * (now(device) - begin)
 
     whole = partial(whole_step(run, stage), batch.context)
     milliseconds = setting.timed(whole)
@@ -158,7 +157,7 @@ def _step(setting: Setting, views: int, size: tuple[int, int], overrides: Sequen
     stages.clear()
     with listening(stage):
         whole()
-    yield {"stage_ms": dict(stages)}
+    yield {"stage_ms": stages}
     yield {"profile": _profile(device, whole)}
 
 

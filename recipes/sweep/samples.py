@@ -120,8 +120,8 @@ class TrainingSamples(Dataset[Sample]):
         )
         parts = [self._scene(layout, rng) for _ in range(self.scenes)]
         parts = [part._replace(sources=part.sources + n * self.views) for n, part in enumerate(parts)]
-        joined = [torch.cat(tensors) for tensors in zip(*(part[:6] for part in parts), strict=True)]
-        return Sample(*joined, layout.planes, self.scenes)
+        joined = {name: torch.cat([getattr(part, name) for part in parts]) for name in Sample._fields[:6]}
+        return Sample(**joined, planes=layout.planes, scenes=self.scenes)
 
     def _scene(self, layout: Layout, rng: Generator) -> Sample:
         while True:
