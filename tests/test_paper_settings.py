@@ -58,7 +58,7 @@ OFFICIAL = ("backend.", "loss.geometry.")
 BOOKKEEPING = (
     "name", "output_dir", "seed", "ckpt", "init_from", "overwrite", "token_cache.", "callbacks.", "logger.",
     "data.workers", "data.memory_mb", "data.seed", "data.steps_per_epoch", "data.index_cache", "data.eval_",
-    "data.train.", "data.val.", "data.train_scenes", "data.view_sets", "data.size_multiple", "data.infinigen_root",
+    "data.train.", "data.val.", "data.train_scenes", "data.view_sets", "data.infinigen_root",
     "data.kitti_root", "data.kitti_depth_root", "data.scannet_root",
     "model.fine.dense_head.views_per_chunk", "model.fine.point_mlp.checkpoint",
     "model.scale.median_depth", "renderer.implementation", "optimizer.fused", "training.max_skipped",

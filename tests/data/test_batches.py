@@ -1,6 +1,7 @@
 """Frames that cannot be read: replaced and counted in training, an error in evaluation."""
 
 import logging
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -8,7 +9,7 @@ import torch
 
 from vg2gt.data import DataError, RGBDFolder
 from vg2gt.data.batches import BatchDataset
-from vg2gt.data.framing import Framing
+from vg2gt.data.transforms import resize_to_cover
 from vg2gt.data.views import SceneSample
 
 from .conftest import SIZE, assert_same_batches, module_of
@@ -16,7 +17,7 @@ from .conftest import SIZE, assert_same_batches, module_of
 
 def _dataset(folder: Path, memory_mb: int = 10, **options) -> BatchDataset:
     source = RGBDFolder(str(folder), holdout=None)
-    return BatchDataset(source, Framing(SIZE).apply, memory_mb, **options)
+    return BatchDataset(source, partial(resize_to_cover, size=SIZE), memory_mb, **options)
 
 
 def _truncate(folder: Path, *names: str) -> None:
@@ -65,7 +66,7 @@ def test_held_out_frames_never_step_in(write_recording):
     folder = write_recording(frames=6)
     _truncate(folder, "images/00010.png")
     source = RGBDFolder(str(folder), holdout=3)  # 11 and 14
-    dataset = BatchDataset(source, Framing(SIZE).apply, 1, replace_damaged=True)
+    dataset = BatchDataset(source, partial(resize_to_cover, size=SIZE), 1, replace_damaged=True)
     assert dataset[(SceneSample("office", (10,)),)].frame_ids.tolist() == [[12]]
 
 

@@ -8,7 +8,7 @@ import torch
 
 from vg2gt.data import DataError, SceneDataModule, SyntheticScenes
 from vg2gt.data.batches import FrameCache
-from vg2gt.data.framing import Framing
+from vg2gt.data.transforms import resize_to_cover
 from vg2gt.data.views.even import EvaluationViews
 
 from .conftest import SIZE, module_of
@@ -84,7 +84,6 @@ class _Recorder(lightning.LightningModule):
 @pytest.mark.parametrize(("stop", "workers"), [(2, 0), (4, 2), (6, 1)])
 def test_a_resumed_run_sees_the_batches_of_the_uninterrupted_one(rooms, tmp_path, stop, workers):
     """Stops within an epoch, at its end and within the next one (4 steps each); workers read ahead of the stop."""
-    drawn = {"aspect": [0.5, 1.0], "size_multiple": 2, "crop": "random", "zoom": [1, 1.2]} if stop == 6 else {}
 
     def run(steps: int, workers: int, **resume) -> _Recorder:
         recorder = _Recorder()
@@ -92,7 +91,7 @@ def test_a_resumed_run_sees_the_batches_of_the_uninterrupted_one(rooms, tmp_path
             max_steps=steps, max_epochs=-1, accelerator="cpu", logger=False, enable_checkpointing=False,
             enable_progress_bar=False, enable_model_summary=False, use_distributed_sampler=False,
         )  # fmt: skip
-        trainer.fit(recorder, datamodule=module_of(rooms, workers=workers, **drawn), **resume)
+        trainer.fit(recorder, datamodule=module_of(rooms, workers=workers), **resume)
         trainer.save_checkpoint(tmp_path / f"{steps}.ckpt")
         return recorder
 
@@ -107,7 +106,7 @@ def test_the_memory_cache_forgets_the_oldest_frame(rooms, monkeypatch):
     load = rooms.load
     monkeypatch.setattr(rooms, "load", lambda scene, ids: loads.append(list(ids)) or load(scene, ids))
     frame_bytes = SIZE[0] * SIZE[1] * 7 + 25 * 4
-    cache = FrameCache(rooms, Framing(SIZE).apply, 3 * frame_bytes)
+    cache = FrameCache(rooms, partial(resize_to_cover, size=SIZE), 3 * frame_bytes)
     first = cache.load("room-000000", [0, 1, 2])
     cache.load("room-000000", [0, 1])
     cache.load("room-000000", [3])  # drops frame 2

@@ -50,10 +50,9 @@ def test_another_seed_gives_other_weights(first: Tensor, tmp_path: Path, cache: 
 
 @pytest.mark.slow
 def test_thirty_steps_are_bit_equal(tmp_path: Path, cache: Path) -> None:
-    """With crops and shapes drawn, several scenes a step, held-out views, and frames read by workers."""
-    drawn = ["data.crop=random", "data.zoom=[1,1.3]", "data.aspect=[0.4,0.6]", "data.max_images=4"]
+    """With several scenes a step, held-out views, and frames read by workers."""
     runs = [
-        trained_weights(tmp_path / str(workers), cache, *drawn, f"data.workers={workers}", steps=30)
+        trained_weights(tmp_path / str(workers), cache, "data.max_images=4", f"data.workers={workers}", steps=30)
         for workers in (0, 0, 1, 2)
     ]
     assert all(torch.equal(run, runs[0]) for run in runs[1:])

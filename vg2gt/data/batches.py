@@ -74,7 +74,7 @@ class BatchDataset(Dataset[Batch]):
 
     Args:
         source: the scenes.
-        prepare: resizes decoded frames before they are cached; to their final size if the views have no ``framing``.
+        prepare: resizes decoded frames to their final size before they are cached.
         memory_mb: size of the cache of decoded frames in each process, in MB.
         replace_damaged: replace an unreadable frame by the nearest readable one, with a warning (training); False
             raises an error (evaluation).
@@ -90,10 +90,7 @@ class BatchDataset(Dataset[Batch]):
 
     def __getitem__(self, views: tuple[SceneSample, ...]) -> Batch:
         loaded = [self._load(view) for view in views]
-        scenes = [
-            view.framing.apply(frames) if view.framing else frames
-            for view, (frames, _) in zip(views, loaded, strict=True)
-        ]
+        scenes = [frames for frames, _ in loaded]
 
         def stack(name: str) -> torch.Tensor:
             return torch.stack([getattr(scene, name) for scene in scenes])

@@ -6,8 +6,9 @@ import os
 import shutil
 import signal
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from lightning.pytorch import LightningDataModule
@@ -15,12 +16,13 @@ from torch.utils.data import DataLoader
 
 from vg2gt.data.base import DataError, SceneSource, SourceMaker
 from vg2gt.data.batches import BatchDataset
-from vg2gt.data.framing import Crop, Fit, FramingSampler
 from vg2gt.data.overlap import refuse_overlap, refuse_untrainable
+from vg2gt.data.transforms import resize_to_cover, resize_to_fit
 from vg2gt.data.views.even import EvaluationViews
 from vg2gt.data.views.sampling import StepSampler, ViewSampler, usable_scenes
 from vg2gt.types import Batch
 
+_FITS = {"cover": resize_to_cover, "pad": resize_to_fit}
 PIXEL_BYTES = 4 * (3 + 1 + 1)  # float32 colour, depth and the mask of some datasets
 
 MOST = 16  # worker limit: more would wait for the disk
@@ -57,11 +59,6 @@ class SceneDataModule(LightningDataModule):
         memory_mb: size of the cache of decoded frames in each process, in MB.
         fit: ``cover`` resizes frames until they cover ``image_size`` and crops; ``pad`` resizes them to fit into it and
             pads with black, which has no depth.
-        aspect: range of height / width from which the image shape of a training step is drawn, at roughly the area of
-            ``image_size`` (``FramingSampler``); None: always ``image_size``. Evaluation always uses ``image_size``.
-        size_multiple: drawn sizes are multiples of this, the backbone's patch size.
-        crop: position of training crops: ``center`` or ``random``.
-        zoom: range from which the zoom of a training scene is drawn.
         common: arguments shared by ``train`` and ``val``, such as the dataset's ``root``.
 
     Raises:
@@ -88,11 +85,7 @@ class SceneDataModule(LightningDataModule):
         seed: int = 0,
         workers: int | None = None,
         memory_mb: int = 1024,
-        fit: Fit = "cover",
-        aspect: Sequence[float] | None = None,
-        size_multiple: int = 14,
-        crop: Crop = "center",
-        zoom: Sequence[float] = (1.0, 1.0),
+        fit: Literal["cover", "pad"] = "cover",
         **common: Any,
     ) -> None:
         super().__init__()
@@ -109,7 +102,10 @@ class SceneDataModule(LightningDataModule):
             )
         self.sampler = ViewSampler(min_views, max_views, max_images, expand_ratio, target_views, seed, view_sets)
         self.eval_views = EvaluationViews(eval_context, eval_target, eval_window)
-        self.framing = FramingSampler(_size(image_size), aspect, size_multiple, fit, crop, zoom, seed)
+        if fit not in _FITS:
+            raise ValueError(f"data.fit must be one of {', '.join(_FITS)}, got {fit!r}")
+        self.image_size = _size(image_size)
+        self.prepare = partial(_FITS[fit], size=self.image_size)
         self.common = common
         self.train_scenes = train_scenes
         self.eval_scenes = eval_scenes
@@ -143,10 +139,8 @@ class SceneDataModule(LightningDataModule):
         names = list(val.scenes)[: self.eval_scenes]
         self._val_views = [views for name in names for views in self.eval_views.choose(val, name)]
         refuse_overlap(train, self._train_names, val, self._val_views)
-        # Cache training frames at their final size, or at the largest size that any drawn framing needs.
-        prepare = self.framing.reduce if self.framing.moves else self.framing.still.apply
-        self._train = BatchDataset(train, prepare, self.memory_mb, replace_damaged=True)
-        self._val = BatchDataset(val, self.framing.still.apply, self.memory_mb)
+        self._train = BatchDataset(train, self.prepare, self.memory_mb, replace_damaged=True)
+        self._val = BatchDataset(val, self.prepare, self.memory_mb)
 
     @property
     def sources(self) -> tuple[SceneSource, SceneSource]:
@@ -183,7 +177,6 @@ class SceneDataModule(LightningDataModule):
             start_step=lambda: trainer.global_step if trainer else 0,
             rank=trainer.global_rank if trainer else 0,
             world_size=trainer.world_size if trainer else 1,
-            framing=self.framing,
         )
         return self._loader(self._train, sampler)
 
@@ -209,7 +202,7 @@ class SceneDataModule(LightningDataModule):
 
     def evaluation_data(self) -> BatchDataset:
         """Returns the evaluation scenes as a dataset that is indexed by tuples of ``SceneSample``, for any views."""
-        return BatchDataset(self._source(self._make_val), self.framing.still.apply, self.memory_mb)
+        return BatchDataset(self._source(self._make_val), self.prepare, self.memory_mb)
 
     def _source(self, make: SceneSource | SourceMaker) -> SceneSource:
         if isinstance(make, SceneSource):
@@ -232,7 +225,7 @@ class SceneDataModule(LightningDataModule):
             return self.workers
         if trainer is None or trainer.strategy.root_device.type != "cuda":
             return 0  # the cores are busy with training
-        height, width = self.framing.largest
+        height, width = self.image_size
         views = self.sampler.max_images * (1 + self.sampler.target_views / self.sampler.min_views)
         return automatic_workers(trainer.num_devices, self.memory_mb, views * height * width * PIXEL_BYTES / 1e6)
 

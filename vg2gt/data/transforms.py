@@ -88,41 +88,20 @@ def pad(frames: Frames, top: int, left: int, size: tuple[int, int]) -> Frames:
     )
 
 
-def resize_to_cover(
-    frames: Frames, size: tuple[int, int], zoom: float = 1.0, place: tuple[float, float] | None = None
-) -> Frames:
-    """Resizes frames until they cover ``size``, keeping their aspect ratio, and crops.
-
-    Args:
-        frames: frames of any size.
-        size: output (height, width).
-        zoom: additional scale factor before cropping, at least 1.
-        place: relative position of the crop window in its range, (down, right) in [0, 1); None: centred.
-    """
+def resize_to_cover(frames: Frames, size: tuple[int, int]) -> Frames:
+    """Resizes frames until they cover ``size`` (height, width), keeping their aspect ratio, and crops the centre."""
     height, width = frames.depth.shape[-2:]
-    scale = max(size[0] / height, size[1] / width) * zoom
+    scale = max(size[0] / height, size[1] / width)
     # Rounding to whole pixels changes the two scales slightly; resize() applies the actual ones to the intrinsics.
     covering = tuple(max(least, _whole(side * scale)) for least, side in zip(size, (height, width), strict=True))
-    room = (covering[0] - size[0], covering[1] - size[1])
     resized = resize(frames, (covering[0], covering[1]))
-    if place is None:
-        return crop(resized, room[0] // 2, room[1] // 2, size)
-    return crop(resized, int(place[0] * (room[0] + 1)), int(place[1] * (room[1] + 1)), size)
+    return crop(resized, (covering[0] - size[0]) // 2, (covering[1] - size[1]) // 2, size)
 
 
 def resize_to_fit(frames: Frames, size: tuple[int, int]) -> Frames:
     """Resizes frames to fit into ``size`` (height, width), keeping their aspect ratio, and pads around them."""
     inner = _fitting(frames, size)
     return pad(resize(frames, inner), (size[0] - inner[0]) // 2, (size[1] - inner[1]) // 2, size)
-
-
-def reduce_to_cover(frames: Frames, size: tuple[int, int]) -> Frames:
-    """Shrinks frames until they just cover ``size``, keeping their aspect ratio; smaller frames are unchanged."""
-    height, width = frames.depth.shape[-2:]
-    scale = max(size[0] / height, size[1] / width)
-    if scale >= 1:
-        return frames
-    return resize(frames, (max(size[0], _whole(height * scale)), max(size[1], _whole(width * scale))))
 
 
 def reduce_to_fit(frames: Frames, size: tuple[int, int]) -> Frames:

@@ -1,5 +1,7 @@
 """COLMAP scenes: a real model, which cameras are refused, reduced images, absent images, points."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
@@ -7,9 +9,9 @@ from PIL import Image
 
 from vg2gt.data import DataError
 from vg2gt.data.batches import BatchDataset
-from vg2gt.data.framing import Framing
 from vg2gt.data.sources import COLMAP
 from vg2gt.data.sources.undistortion import pinhole_camera
+from vg2gt.data.transforms import resize_to_cover
 from vg2gt.data.views import SceneSample
 from vg2gt.evaluation.checks import refuse_without_hints
 from vg2gt.geometry.cameras import resize_intrinsics, unproject
@@ -199,7 +201,7 @@ def test_masks_go_with_a_batch_and_take_its_depth_away(tmp_path, caplog):
     assert whole.mask.mean((1, 2)).tolist() == [0.5, 0.5, 0.5, 1]
     assert "1 of 4 images have no mask in" in caplog.text
     assert "left/027.png" in caplog.text
-    data = BatchDataset(COLMAP(str(tmp_path), depth="points"), Framing((28, 42)).apply, 10)
+    data = BatchDataset(COLMAP(str(tmp_path), depth="points"), partial(resize_to_cover, size=(28, 42)), 10)
     batch = data[(SceneSample("statue", (0, 1), (2,)),)]
     assert batch.mask is not None
     assert batch.hints.mask is not None

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from vg2gt.data.framing import Framing
-
 
 @dataclass(frozen=True)
 class SceneSample:
@@ -20,13 +18,11 @@ class SceneSample:
         scene: the scene's name.
         context: frame ids of the input views; the first is the anchor, whose camera becomes the world frame.
         target: frame ids of the held-out views, disjoint from ``context``.
-        framing: size, zoom and crop window drawn for the scene; None: the fixed framing of evaluation.
     """
 
     scene: str
     context: tuple[int, ...]
     target: tuple[int, ...] = ()
-    framing: Framing | None = None
 
     @property
     def frames(self) -> tuple[int, ...]:

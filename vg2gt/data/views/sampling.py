@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
 from math import gcd, lcm
@@ -18,7 +18,6 @@ import numpy as np
 from torch.utils.data import Sampler
 
 from vg2gt.data.base import DataError, SceneSource, training_frames
-from vg2gt.data.framing import FramingSampler
 from vg2gt.data.views import SceneSample
 
 log = logging.getLogger(__name__)
@@ -246,7 +245,7 @@ def _nothing_usable(
 
 @dataclass(eq=False)
 class StepSampler(Sampler[tuple[SceneSample, ...]]):
-    """Yields the views of one device's batch, with their framing, step by step.
+    """Yields the views of one device's batch, step by step.
 
     Args:
         source: the training scenes.
@@ -257,7 +256,6 @@ class StepSampler(Sampler[tuple[SceneSample, ...]]):
             epoch that contains this step.
         rank: index of this device.
         world_size: number of devices.
-        framing: draws sizes and crops; None: nothing is drawn.
     """
 
     source: SceneSource
@@ -267,7 +265,6 @@ class StepSampler(Sampler[tuple[SceneSample, ...]]):
     start_step: Callable[[], int] = lambda: 0
     rank: int = 0
     world_size: int = 1
-    framing: FramingSampler | None = None
 
     def __post_init__(self) -> None:
         self.pool = scene_pool(self.source, self.scenes, self.views.seed)
@@ -285,8 +282,7 @@ class StepSampler(Sampler[tuple[SceneSample, ...]]):
         places = self.views.slots(step, self.rank, self.world_size)
         scenes = [self.pool.scene(place) for place in places]
         first = self.rank * len(scenes)
-        return tuple(self._scene(step, scene, first + number) for number, scene in enumerate(scenes))
-
-    def _scene(self, step: int, scene: str, slot: int) -> SceneSample:
-        views = self.views.views(step, scene, training_frames(self.source, scene), slot)
-        return replace(views, framing=self.framing.draw(step, slot)) if self.framing else views
+        return tuple(
+            self.views.views(step, scene, training_frames(self.source, scene), first + number)
+            for number, scene in enumerate(scenes)
+        )
