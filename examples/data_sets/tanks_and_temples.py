@@ -21,8 +21,8 @@ from vg2gt.data.sources.parsing import (
     numbered,
     pinhole,
     read_matrix,
+    read_text_lines,
 )
-from vg2gt.data.sources.rgbd_cameras import read_log
 from vg2gt.data.sources.undistortion import is_pinhole, posed_image, size_on_disk
 from vg2gt.io import colmap_images, read_colmap
 from vg2gt.io.colmap import Camera
@@ -86,7 +86,7 @@ class TanksAndTemples(FileSource):
         color = numbered(folder / "images" if (folder / "images").is_dir() else folder, scene)
         if not color:
             raise DataError(f"scene {scene} has no images in {folder / 'images'} or {folder}")
-        poses = read_log(log_file, scene)
+        poses = _read_log(log_file, scene)
         if len(poses) != len(color):
             raise DataError(
                 f"{log_file} of scene {scene} has {len(poses)} poses for {len(color)} images; they are matched by "
@@ -143,6 +143,25 @@ def moved(similarity: NDArray[np.float64], pose: NDArray[np.float64]) -> NDArray
     out = similarity @ pose
     out[:3, :3] /= scale
     return out
+
+
+def _read_log(path: Path, scene: str) -> list[NDArray[np.float64] | None]:
+    """Reads, for each image, a line of three integers and a 4x4 camera-to-world matrix; None if the second is -1."""
+    rows = [line.split() for line in read_text_lines(path, scene)]
+    if not rows or len(rows) % 5:
+        raise DataError(f"{path} of scene {scene} has {len(rows)} lines; expected five for each image")
+    poses: list[NDArray[np.float64] | None] = []
+    for start in range(0, len(rows), 5):
+        header, matrix = rows[start], rows[start + 1 : start + 5]
+        try:
+            numbers = [int(word) for word in header]
+            values = np.array([[float(word) for word in row] for row in matrix])
+        except ValueError as error:
+            raise DataError(f"{path} of scene {scene}, image {start // 5}: {error}") from error
+        if len(numbers) != 3 or values.shape != (4, 4):
+            raise DataError(f"{path} of scene {scene}, image {start // 5}: expected 3 numbers and a 4x4 matrix")
+        poses.append(None if numbers[1] < 0 else values)
+    return poses
 
 
 def _read_similarity(path: Path, scene: str) -> NDArray[np.float64]:

@@ -20,10 +20,10 @@ from vg2gt.data.sources.parsing import (
     named_file,
     pinhole,
     positive,
+    read_matrix,
     read_numbers,
     read_text_lines,
 )
-from vg2gt.data.sources.rgbd_cameras import INTRINSICS_FILES, read_camera
 
 INTRINSICS = {
     "freiburg1": (517.3, 516.5, 318.6, 255.3),
@@ -105,11 +105,8 @@ class TUM(FileSource):
         named = _CAMERA.search(scene)
         if self.intrinsics is not None:
             return self.intrinsics
-        beside = [folder / name for name in INTRINSICS_FILES if (folder / name).is_file()]
-        if beside:
-            matrix, upwards = read_camera(beside[0], scene)
-            if upwards:
-                raise DataError(f"{beside[0]} of scene {scene} has a negative fy: poses of this layout are OpenCV's")
+        if (folder / "K.txt").is_file():
+            matrix = read_matrix(folder / "K.txt", scene, ((3, 3),))
             return matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
         if named is None:
             raise DataError(

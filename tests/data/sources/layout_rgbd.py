@@ -1,6 +1,5 @@
 """RGB-D folders: one file of poses, one file a pose, 7-Scenes."""
 
-import json
 from functools import partial
 from pathlib import Path
 
@@ -9,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from vg2gt.data import Frames, RGBDFolder
 
-from .layouts import Layout, camera_of, camera_to_world, millimetres, pixels, save
+from .layouts import Layout, camera_to_world, millimetres, pixels, save
 
 
 def write_recording(root: Path, frames: Frames, scene: str = "office", first: int = 10, digits: int = 5) -> Path:
@@ -48,40 +47,20 @@ def write_seven_scenes(root: Path, frames: Frames) -> None:
     np.savetxt(root / "chess" / "camera-intrinsics.txt", frames.intrinsics[0].numpy())
 
 
-def _write_open3d(root: Path, frames: Frames) -> None:
-    """As Redwood's recordings, and Open3D's after a reconstruction."""
-    lines = []
-    for i, pose in enumerate(camera_to_world(frames)):
-        save(root / "den" / "image" / f"{i + 1:06d}.png", pixels(frames)[i])
-        save(root / "den" / "depth" / f"{i + 1:06d}.png", millimetres(frames)[i])
-        lines += [f"{i} {i} {i + 1}", *(" ".join(map(repr, row)) for row in pose.tolist())]
-    (root / "den" / "trajectory.log").write_text("\n".join(lines))
-    height, width = frames.depth.shape[-2:]
-    matrix = frames.intrinsics[0].T.flatten().tolist()
-    camera = {"width": width, "height": height, "intrinsic_matrix": matrix}
-    (root / "den" / "camera_intrinsic.json").write_text(json.dumps(camera))
-
-
-def _write_icl_nuim(root: Path, frames: Frames) -> None:
-    """y points up in the cameras and in the world; a line is a time, a position and a quaternion."""
-    mirror = np.diag([1.0, -1, 1, 1])
-    rows = []
-    for i, pose in enumerate(mirror @ camera_to_world(frames) @ mirror):
-        save(root / "living" / "rgb" / f"{i}.png", pixels(frames)[i])
-        save(root / "living" / "depth" / f"{i}.png", (frames.depth[i].numpy() * 5000 + 0.5).astype(np.uint16))
-        rows.append([i, *pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()])
-    np.savetxt(root / "living" / "trajectory.txt", np.array(rows), "%.17g")
-    fx, fy, cx, cy = camera_of(frames)
-    (root / "living" / "K.txt").write_text(f"{fx!r} {-fy!r} {cx!r} {cy!r}\n")
+def _write_rows(root: Path, frames: Frames, quaternions: bool) -> None:
+    """Poses as 3x4 matrices, or as a time, a position and a quaternion."""
+    folder, poses = write_recording(root, frames), camera_to_world(frames)
+    rows = [[9.5, *pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()] for pose in poses]
+    np.savetxt(folder / "poses.txt", rows if quaternions else poses[:, :3].reshape(-1, 12), "%.17g")
 
 
 READ = partial(RGBDFolder, holdout=None)
 LAYOUTS = {
     "rgbd": Layout(write_recording, READ, frame_ids=range(10, 16)),
+    "rgbd_3x4": Layout(partial(_write_rows, quaternions=False), READ, frame_ids=range(10, 16)),
+    "rgbd_quaternions": Layout(partial(_write_rows, quaternions=True), READ, frame_ids=range(10, 16)),
     "rgbd_pose_files": Layout(
         lambda root, frames: write_pose_files(root / "hall", frames), READ, image_error=0.012, frame_ids=range(8, 14)
     ),
-    "rgbd_open3d": Layout(_write_open3d, READ, frame_ids=range(1, 7)),
-    "rgbd_icl_nuim": Layout(_write_icl_nuim, partial(READ, depth_scale=5000), depth_quantum=2e-4),
     "seven_scenes": Layout(write_seven_scenes, READ),
 }

@@ -12,7 +12,7 @@ from vg2gt.geometry.cameras import relative_to_first
 from .layouts import SIZE, all_layouts, cameras_of, room
 
 LAYOUTS = all_layouts()
-NEED_ALL = ("rgbd", "rgbd_open3d", "rgbd_icl_nuim", "tanks_and_temples")
+NEED_ALL = ("rgbd", "rgbd_3x4", "rgbd_quaternions", "tanks_and_temples")
 """Poses belong to images by their order, so that none may be absent."""
 
 

@@ -67,14 +67,6 @@ def test_an_index_that_mixes_input_and_target_or_miscounts_is_refused(tmp_path: 
         ViewSelection(index=str(path)).choose(listed(range(40)), ["a"], 2)
 
 
-def test_fixed_views() -> None:
-    views = ViewSelection(fixed={3: [23, 24, 33]}).draw(listed(range(49)), "a", 3)
-    assert views.context == (23, 24, 33)
-    assert all(24 < frame < 33 for frame in views.target)
-    with pytest.raises(ValueError, match=r"fixed\[3\] must list 3 distinct frames, got \[1, 2\]"):
-        ViewSelection(fixed={3: [1, 2]})
-
-
 def test_an_index_overrides_the_draw_and_gaps_are_drawn_with_a_warning(tmp_path: Path, caplog) -> None:
     path = tmp_path / "mine.json"
     entry = {"context": [7, 5], "target": [6]}
@@ -114,9 +106,9 @@ def test_the_command_repeats_the_index_of_real_recordings(tmp_path: Path, shared
     assert path.read_text() == index_path("rgbd").read_text()
 
 
-def test_dtus_index_is_what_its_49_frames_give() -> None:
+def test_dtus_index_is_what_its_49_frames_give_but_for_the_three_fixed_views() -> None:
     stored = read_index("dtu")
     assert len(stored) == 15
-    fixed = ViewSelection(fixed={3: [23, 24, 33]})
-    assert make_index(fixed, listed(range(49)), list(stored), [3, 10, 20])["scenes"] == stored
+    drawn = make_index(ViewSelection(), listed(range(49)), list(stored), [10, 20])["scenes"]
+    assert drawn == {scene: {count: views[count] for count in ("10", "20")} for scene, views in stored.items()}
     assert all(views["3"]["context"] == [23, 24, 33] for views in stored.values())

@@ -21,6 +21,7 @@ EARTH_RADIUS = 6378137.0
 
 _CALIBRATION = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt", "calib_imu_to_velo.txt")
 _SPLITS = ("train", "val")
+_IMAGES = "image_02/data"
 
 
 class KITTI(FileSource):
@@ -38,12 +39,11 @@ class KITTI(FileSource):
         root: KITTI raw, the folder that contains the dates.
         depth_root: the annotated depth, the folder that contains ``train`` and ``val``; None: the same as ``root``.
         split: the benchmark's ``train`` or ``val`` drives; None: both.
-        camera: 2 for the left colour camera, 3 for the right one.
         shared: see ``FileSource``; the frame rate is 10 frames per second.
     """
 
     layout = "KITTI raw: DATE/DRIVE_sync/image_02/data, with depth for it in {train,val}/DRIVE_sync/proj_depth"
-    index_options = ("camera", "splits", "depth_root")
+    index_options = ("splits", "depth_root")
     sparse_depth = True
     depth_scale = 256.0
 
@@ -52,21 +52,17 @@ class KITTI(FileSource):
         root: str | Sequence[str] | None,
         depth_root: str | None = None,
         split: str | None = None,
-        camera: int = 2,
         **shared: Unpack[HoldoutOptions],
     ) -> None:
         if split not in (None, *_SPLITS):
             raise ValueError(f"split must be train, val or null (both), got {split!r}")
-        if camera not in (2, 3):
-            raise ValueError(f"camera must be 2 (left) or 3 (right), the colour cameras, got {camera}")
         self.depth_root = existing_depth_root(depth_root)
         self.splits = (split,) if split else _SPLITS
-        self.camera = camera
         super().__init__(root, **shared)
 
     def find(self, root: Path) -> Mapping[str, Path]:
-        """Finds the drives that have images of the camera and a depth folder."""
-        drives = {path.name: path for path in sorted(root.glob("*/*_sync")) if (path / self._images).is_dir()}
+        """Finds the drives that have images and a depth folder."""
+        drives = {path.name: path for path in sorted(root.glob("*/*_sync")) if (path / _IMAGES).is_dir()}
         return {name: folder for name, folder in drives.items() if self._depth_folder(folder) is not None}
 
     def watched(self, scene: str, folder: Path) -> Sequence[Path | None]:
@@ -80,22 +76,18 @@ class KITTI(FileSource):
         if not depth:
             raise DataError(f"scene {scene} has no annotated depth in {depth_folder}")
         numbers = range(min(depth), max(depth) + 1)
-        color = {i: path for i, path in numbered(folder / self._images, scene).items() if i in numbers}
+        color = {i: path for i, path in numbered(folder / _IMAGES, scene).items() if i in numbers}
         if not color:
             raise DataError(f"scene {scene} has depth of frames {numbers}, but no image of them in {folder}")
-        intrinsics, camera_from_imu = read_calibration(folder.parent, scene, self.camera)
+        intrinsics, camera_from_imu = read_calibration(folder.parent, scene)
         packets = numbered(folder / "oxts" / "data", scene, suffixes=(".txt",))
         imu = imu_to_world({number: _read_packet(path, scene) for number, path in packets.items()})
         poses = {i: pose @ invert_pose(camera_from_imu) for i, pose in imu.items() if i in numbers}
         return make_index(scene, folder, color, depth, poses, intrinsics)
 
-    @property
-    def _images(self) -> str:
-        return f"image_0{self.camera}/data"
-
     def _depth_folder(self, drive: Path) -> Path | None:
         root = self.depth_root or drive.parents[1]
-        inside = f"{drive.name}/proj_depth/groundtruth/image_0{self.camera}"
+        inside = f"{drive.name}/proj_depth/groundtruth/image_02"
         return next((root / split / inside for split in self.splits if (root / split / inside).is_dir()), None)
 
 
@@ -126,20 +118,20 @@ def imu_to_world(packets: Mapping[int, NDArray[np.float64]]) -> dict[int, NDArra
     return dict(zip(packets, poses, strict=True))
 
 
-def read_calibration(folder: Path, scene: str, camera: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Reads the intrinsics ``[3, 3]`` of a rectified camera and the transform ``camera <- imu`` ``[4, 4]``.
+def read_calibration(folder: Path, scene: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Reads the left colour camera's rectified intrinsics ``[3, 3]`` and the transform ``camera <- imu`` ``[4, 4]``.
 
     Raises:
         DataError: if a calibration file of the date is missing or invalid.
     """
     cameras, velodyne, imu = (_read_fields(folder / name, scene) for name in _CALIBRATION)
     where = f"{folder} (calibration of scene {scene})"
-    projection = _field(cameras, f"P_rect_0{camera}", (3, 4), where)
+    projection = _field(cameras, "P_rect_02", (3, 4), where)
     rectify = np.eye(4)
     rectify[:3, :3] = _field(cameras, "R_rect_00", (3, 3), where)
     intrinsics = projection[:, :3]
     if abs(np.linalg.det(intrinsics)) < 1e-6:
-        raise DataError(f"P_rect_0{camera} in {where} is not a projection: {projection.tolist()}")
+        raise DataError(f"P_rect_02 in {where} is not a projection: {projection.tolist()}")
     shift = np.eye(4)
     shift[:3, 3] = np.linalg.solve(intrinsics, projection[:, 3])
     steps = np.stack((rectify, _transform(velodyne, where), _transform(imu, where)))

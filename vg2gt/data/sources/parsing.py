@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from vg2gt.data.base import DataError
 from vg2gt.io.cameras_json import invert_pose
@@ -62,15 +63,34 @@ def read_matrix(path: Path, scene: str, shapes: Sequence[tuple[int, int]]) -> ND
 
 def read_poses(files: Mapping[int, Path], scene: str) -> dict[int, NDArray[np.float64]]:
     """Reads one 4x4 matrix per file, in parallel, because opening a file on a network disk takes milliseconds."""
-    numbers = list(files)
-
-    def read(part: Sequence[int]) -> dict[int, NDArray[np.float64]]:
-        return {number: read_matrix(files[number], scene, ((4, 4),)) for number in part}
-
     with ThreadPoolExecutor(_THREADS) as pool:
-        parts = pool.map(read, [numbers[start::_THREADS] for start in range(_THREADS)])
-        poses = {number: pose for part in parts for number, pose in part.items()}
-    return {number: poses[number] for number in numbers}
+        poses = pool.map(lambda path: read_matrix(path, scene, ((4, 4),)), files.values())
+        return dict(zip(files, poses, strict=True))
+
+
+def pose_file_of(folder: Path) -> Path | None:
+    """Returns the file of all poses in a recording's folder, if there is one."""
+    return next((folder / name for name in ("poses.txt", "pose.txt") if (folder / name).is_file()), None)
+
+
+def pose_matrices(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Converts rows to poses ``[n, 4, 4]``: a 4x4 or 3x4 matrix, or x y z qx qy qz qw, optionally after a timestamp.
+
+    An invalid quaternion gives a pose of NaN.
+    """
+    count = rows.shape[1]
+    if count == 16:
+        return rows.reshape(-1, 4, 4)
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    if count == 12:
+        poses[:, :3] = rows.reshape(-1, 3, 4)
+        return poses
+    numbers = rows[:, -7:]
+    good = np.isfinite(numbers).all(1) & (np.linalg.norm(numbers[:, 3:], axis=1) > 0.5)
+    poses[~good] = np.nan
+    poses[good, :3, :3] = Rotation.from_quat(numbers[good, 3:]).as_matrix()
+    poses[good, :3, 3] = numbers[good, :3]
+    return poses
 
 
 def read_text_lines(path: Path, scene: str) -> list[str]:

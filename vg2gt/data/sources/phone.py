@@ -23,8 +23,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vg2gt.data.sources.parsing import CORNER_TO_CENTER, errors_name, numbered, pinhole
-from vg2gt.data.sources.rgbd_cameras import pose_file_of, pose_matrices
+from vg2gt.data.sources.parsing import (
+    CORNER_TO_CENTER,
+    errors_name,
+    numbered,
+    pinhole,
+    pose_file_of,
+    pose_matrices,
+)
 from vg2gt.io.errors import FormatError
 from vg2gt.io.files import regular
 from vg2gt.io.image_files import Size, check_size, image_size, read_color

@@ -3,9 +3,9 @@
 The layout is detected from the files present:
 
 * folders: colour in ``images/``, ``color/``, ``rgb/`` or ``image/``, depth in ``depth/``. Poses are in ``poses.txt``
-  (16 numbers per line, in image order; other formats: ``rgbd_cameras``), or in one text file per frame in ``pose/`` or
+  (16, 12 or 7 numbers per line, in image order), or in one text file per frame in ``pose/`` or
   ``poses/``. Intrinsics are in ``K.txt`` (3x3) or in ``intrinsic/intrinsic_{color,depth}.txt`` (4x4, as exported from
-  ScanNet). This covers recordings of Open3D and Redwood (``trajectory.log``, ``camera_intrinsic.json``) and ICL-NUIM;
+  ScanNet);
 * exports of Record3D, Polycam and Stray Scanner: see ``phone``;
 * 7-Scenes: ``frame-NNNNNN.{color.png|jpg,depth.png,pose.txt}`` in one folder, intrinsics in ``camera-intrinsics.txt``.
 
@@ -34,7 +34,11 @@ from vg2gt.data.sources.parsing import (
     four_intrinsics,
     numbered,
     pinhole,
+    pose_file_of,
+    pose_matrices,
     positive,
+    read_matrix,
+    read_numbers,
     read_poses,
 )
 from vg2gt.data.sources.phone import (
@@ -47,14 +51,6 @@ from vg2gt.data.sources.phone import (
     read_export,
     read_metres,
 )
-from vg2gt.data.sources.rgbd_cameras import (
-    INTRINSICS_FILES,
-    POSE_FILES,
-    mirrored,
-    pose_file_of,
-    read_camera,
-    read_pose_list,
-)
 from vg2gt.data.sources.scannet import room_of_scan
 from vg2gt.geometry.cameras import resize_intrinsics
 from vg2gt.io.image_files import Size, check_size, read_depth
@@ -63,6 +59,8 @@ from vg2gt.io.video import read_frame
 
 log = logging.getLogger(__name__)
 
+_INTRINSICS_FILES = ("K.txt", "camera-intrinsics.txt")
+_POSE_COLUMNS = {16: "4x4 camera-to-world", 12: "3x4", 7: "x y z qx qy qz qw", 8: "time and x y z qx qy qz qw"}
 _COLOR_FOLDERS = ("images", "color", "rgb", "image")
 _POSE_FOLDERS = ("pose", "poses")
 _OFF_CENTRE = 0.15  # maximum offset of the principal point from the centre, as a fraction of width or height
@@ -190,34 +188,42 @@ class RGBDFolder(FileSource):
         if poses is None:
             raise DataError(
                 f"scene {scene} in {folder} has {len(color)} colour and {len(depth)} depth images but no poses: add "
-                "poses.txt (a line of 16 numbers, 4x4 camera-to-world, for each image), or one of "
-                f"{', '.join(POSE_FILES[1:])}"
+                "poses.txt (a line of 16 numbers, 4x4 camera-to-world, for each image)"
             )
-        read = read_poses(poses, scene) if isinstance(poses, dict) else read_pose_list(poses, scene, list(color))
-        intrinsics, upwards = np.eye(3), False
+        read = read_poses(poses, scene) if isinstance(poses, dict) else _read_pose_list(poses, scene, list(color))
+        intrinsics = np.eye(3)
         if self.intrinsics is None:
             known = [path for path in cameras if path.is_file()]
-            intrinsics, upwards = _read_intrinsics(known, folder, scene, color_size, depth_size)
+            intrinsics = _read_intrinsics(known, folder, scene, color_size, depth_size)
         if color_size[0] > depth_size[0]:
             larger, smaller = (f"{size[1]}x{size[0]}" for size in (color_size, depth_size))
             _say(f"scene {scene}: colour of {larger} is reduced to the depth's {smaller}", logging.WARNING)
-        read = mirrored(read) if upwards else read
         return Recording(layout, color, depth, read, dict.fromkeys(color, intrinsics), color_size, depth_size)
 
 
-def _read_intrinsics(
-    files: Sequence[Path], folder: Path, scene: str, color: Size, depth: Size
-) -> tuple[NDArray[np.float64], bool]:
-    """Returns the intrinsics of the colour images, preferably from ``intrinsic_depth.txt``, and whether y points up."""
+def _read_pose_list(path: Path, scene: str, frames: Sequence[int]) -> dict[int, NDArray[np.float64]]:
+    """Reads camera-to-world poses ``[4, 4]`` by frame number from a file with one line per image, in image order."""
+    rows = read_numbers(path, scene)
+    if rows.shape[1] not in _POSE_COLUMNS or len(rows) != len(frames):
+        known = "; or ".join(f"{count}: {text}" for count, text in _POSE_COLUMNS.items())
+        raise DataError(
+            f"{path} of scene {scene} must have one line of numbers ({known}) for each of the {len(frames)} images; it "
+            f"has {len(rows)} lines of {rows.shape[1]}"
+        )
+    return dict(zip(frames, pose_matrices(rows), strict=True))
+
+
+def _read_intrinsics(files: Sequence[Path], folder: Path, scene: str, color: Size, depth: Size) -> NDArray[np.float64]:
+    """Returns the intrinsics of the colour images, preferably from ``intrinsic_depth.txt``."""
     if not files:
         raise DataError(
             f"scene {scene} in {folder} has no intrinsics: add K.txt (3x3), or set data.intrinsics=[fx,fy,cx,cy]"
         )
     path = next((path for path in files if path.name == "intrinsic_depth.txt"), files[0])
     size = depth if path.name == "intrinsic_depth.txt" else color
-    matrix, upwards = read_camera(path, scene)
+    matrix = read_matrix(path, scene, ((3, 3), (4, 4)))[:3, :3]
     _check_resolution(matrix, f"{path} of scene {scene}", size)
-    return _resized(matrix, size, color), upwards
+    return _resized(matrix, size, color)
 
 
 def _resized(matrix: NDArray[np.float64], size: Size, target: Size) -> NDArray[np.float64]:
@@ -250,4 +256,4 @@ def _exported_intrinsics(folder: Path) -> list[Path]:
 
 
 def _beside(folder: Path) -> list[Path]:
-    return [folder / name for name in INTRINSICS_FILES]
+    return [folder / name for name in _INTRINSICS_FILES]

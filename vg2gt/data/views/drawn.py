@@ -1,9 +1,9 @@
 """Evaluation views, drawn from a seed or read from an index file.
 
 All datasets of the paper are sequences, so views are drawn from a limited range of consecutive frames (paper, appendix
-A.2); the three views of DTU are fixed. A draw depends only on the seed, the scene's name, its frames and the number of
-views. An index is a JSON file with the frame ids of a draw, so that results stay reproducible if the sampling code
-changes.
+A.2). A draw depends only on the seed, the scene's name, its frames and the number of views. An index is a JSON file
+with the frame ids of a draw, so that results stay reproducible if the sampling code changes. The packaged index of DTU
+holds the paper's three fixed views.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -36,18 +36,15 @@ class ViewSelection:
         targets: maximum number of held-out views per sample.
         spread: N input views and their targets are drawn from ``spread * N`` consecutive frames.
         seed: random seed of the draw.
-        fixed: frame ids of the input views by number of views, such as ``{3: [23, 24, 33]}``.
 
     Raises:
-        ValueError: if a number is out of range, or if an entry of ``fixed`` does not list as many distinct frames as
-            its key says.
+        ValueError: if a number is out of range.
     """
 
     index: str | None = None
     targets: int = 4
     spread: float = 2.0
     seed: int = 0
-    fixed: Mapping[int, Sequence[int]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.targets < 0 or self.spread < 1:
@@ -55,18 +52,13 @@ class ViewSelection:
                 "evaluation.selection needs targets >= 0 and spread >= 1, "
                 f"got targets={self.targets}, spread={self.spread}"
             )
-        for count, frames in self.fixed.items():
-            if len(set(frames)) != count:
-                raise ValueError(
-                    f"evaluation.selection.fixed[{count}] must list {count} distinct frames, got {list(frames)}"
-                )
 
     def choose(self, source: SceneSource, scenes: Sequence[str], count: int) -> list[SceneSample]:
         """Returns one sample of ``count`` input views per scene.
 
         Raises:
-            DataError: if a scene has too few frames or lacks a frame of the index or ``fixed``, or if an entry of the
-                index has a different number of input views or a repeated frame.
+            DataError: if a scene has too few frames or lacks a frame of the index, or if an entry of the index has a
+                different number of input views or a repeated frame.
         """
         stored = read_index(self.index)
         chosen = [_stored_views(stored, scene, count) or self.draw(source, scene, count) for scene in scenes]
@@ -94,13 +86,9 @@ class ViewSelection:
         rng = np.random.default_rng(
             int.from_bytes(hashlib.sha256(f"{self.seed}/{scene}/{count}".encode()).digest(), "big")
         )
-        if count in self.fixed:
-            context = list(self.fixed[count])
-            window = frames
-        else:
-            window = self._window(frames, held_out, scene, count, rng)
-            inputs = [frame for frame in window if frame not in held_out]
-            context = sorted(rng.choice(inputs, count, replace=False).tolist())
+        window = self._window(frames, held_out, scene, count, rng)
+        inputs = [frame for frame in window if frame not in held_out]
+        context = sorted(rng.choice(inputs, count, replace=False).tolist())
         rest = [frame for frame in window if frame not in context and (frame in held_out or not held_out)]
         rest = [frame for frame in rest if context[0] < frame < context[-1]] or rest
         target = sorted(rng.choice(rest, min(self.targets, len(rest)), replace=False).tolist()) if rest else []
@@ -192,8 +180,8 @@ def _check_frames(source: SceneSource, views: SceneSample, count: int) -> None:
     if len(views.context) != count or len(set(views.frames)) != len(views.frames):
         raise DataError(
             f"the evaluation views of scene {views.scene} must be {count} distinct input views and distinct held-out "
-            f"views, got input {list(views.context)}, held out {list(views.target)}; correct evaluation.selection "
-            "(index, fixed), or draw views with evaluation.selection.index=null"
+            f"views, got input {list(views.context)}, held out {list(views.target)}; correct the index, or draw views "
+            "with evaluation.selection.index=null"
         )
     missing = sorted(set(views.frames) - set(source.frames(views.scene)))
     if missing:
