@@ -23,6 +23,7 @@ from vg2gt.data.sources.parsing import (
     expanded,
     numbered,
     read_text_lines,
+    rigid,
     to_world,
 )
 from vg2gt.io.image_files import Size, read_depth
@@ -208,7 +209,9 @@ def _read_camera(path: Path, scene: str) -> tuple[NDArray[np.float64], NDArray[n
         raise DataError(f"{path} of scene {scene} is not a camera of MVSNet: {error}") from error
     check_intrinsics(intrinsics, f"{path} of scene {scene}")
     pose[:3, 3] *= MILLIMETRE
-    return to_world(pose, f"{path} of scene {scene}"), intrinsics
+    if np.isfinite(pose).all():
+        pose = rigid(pose[None], [0], f"{path} of scene {scene}")[0]
+    return to_world(pose), intrinsics
 
 
 def _read_cameras(

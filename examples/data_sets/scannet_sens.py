@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from vg2gt.data.base import DataError
 from vg2gt.data.sources.index import SceneIndex, make_index
-from vg2gt.data.sources.scannet import ScanNet
+from vg2gt.data.sources.rgbd import ScanNet
 from vg2gt.io.files import regular
 from vg2gt.io.image_files import Size, read_color
 

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from examples.worlds import street
 from vg2gt.data.synthetic.builder import Builder
-from vg2gt.data.synthetic.renderer import World
-from vg2gt.data.synthetic.sky import draw_sky
+from vg2gt.data.synthetic.renderer import World, draw_sky
 from vg2gt.data.synthetic.synthetic_scene import SyntheticScene, level_poses
 from vg2gt.data.synthetic.textures import Pattern
 

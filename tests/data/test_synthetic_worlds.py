@@ -35,7 +35,6 @@ def test_the_seed_decides_the_world_and_highlights_its_colour_alone(kind):
     brighter = 0
     for a, b in zip(scene.render(range(4), 1), shiny.render(range(4), 1), strict=True):
         assert np.array_equal(a.depth, b.depth)
-        assert np.array_equal(a.normal, b.normal)
         assert (b.image.astype(int) - a.image >= -1).all()  # light is added, never taken
         brighter += (b.image > a.image + 3).any(-1).mean()
     assert brighter > 0.001
@@ -75,13 +74,6 @@ def test_culling_and_the_sun_lose_no_hit():
     culled, full = (render_frame(world, pose, scene.intrinsics, SIZE) for world in (scene.world, plain))
     assert np.array_equal(culled.depth, full.depth)
     assert (culled.image != full.image).mean() < 1e-3  # a ray that grazes two parts
-
-
-def test_landmarks_are_seen_from_wide_baselines():
-    """Degrees from the first to the last camera, around the middle."""
-    position = np.array([places(SyntheticLandmark(seed, 8, SIZE)) for seed in range(12)])
-    angles = np.unwrap(np.arctan2(position[..., 1], position[..., 0]))
-    assert np.median(np.degrees(abs(angles[:, -1] - angles[:, 0]))) > 70
 
 
 def test_a_wide_room_is_the_room_of_its_seed_seen_from_all_around():

@@ -38,9 +38,13 @@ class FrameCache:
         """Returns frames of a scene in the given order; decodes those that are not cached."""
         missing = [frame for frame in frame_ids if (scene, frame) not in self._frames]
         fresh = self._decode(scene, missing) if missing else {}
-        chosen = [fresh[frame] if frame in fresh else self._recall(scene, frame) for frame in frame_ids]
-        for frame, value in fresh.items():
-            self._keep((scene, frame), value)
+        chosen = [fresh[frame] if frame in fresh else self._frames[scene, frame] for frame in frame_ids]
+        for frame, value in zip(frame_ids, chosen, strict=True):
+            self._used += _size(value) if frame in fresh else 0
+            self._frames[scene, frame] = value
+            self._frames.move_to_end((scene, frame))
+        while self._used > self.capacity:
+            self._used -= _size(self._frames.popitem(last=False)[1])
         frames = Frames.concatenate(chosen)
         return replace(frames, images=from_bytes(frames.images))
 
@@ -52,21 +56,9 @@ class FrameCache:
             for row, frame in enumerate(frame_ids)
         }
 
-    def _recall(self, scene: str, frame: int) -> Frames:
-        self._frames.move_to_end((scene, frame))
-        return self._frames[scene, frame]
-
-    def _keep(self, key: tuple[str, int], frames: Frames) -> None:
-        self._frames[key] = frames
-        self._used += _size(frames)
-        while self._used > self.capacity:
-            _, dropped = self._frames.popitem(last=False)
-            self._used -= _size(dropped)
-
 
 def _size(frames: Frames) -> int:
-    mask = 0 if frames.mask is None else frames.mask.nbytes
-    return mask + frames.images.nbytes + frames.depth.nbytes + frames.world_to_camera.nbytes + frames.intrinsics.nbytes
+    return sum(value.nbytes for value in vars(frames).values() if isinstance(value, torch.Tensor))
 
 
 class BatchDataset(Dataset[Batch]):

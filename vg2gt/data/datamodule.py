@@ -196,10 +196,6 @@ class SceneDataModule(LightningDataModule):
         """Copies a batch to the device, asynchronously from pinned memory on CUDA."""
         return batch.to(device, non_blocking=device.type == "cuda")
 
-    def test_dataloader(self) -> DataLoader[Batch]:
-        """Returns the evaluation batches (``val_dataloader``)."""
-        return self.val_dataloader()
-
     def evaluation_data(self) -> BatchDataset:
         """Returns the evaluation scenes as a dataset that is indexed by tuples of ``SceneSample``, for any views."""
         return BatchDataset(self._source(self._make_val), self.prepare, self.memory_mb)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 
 from vg2gt.data.base import DataError, SceneSource
 from vg2gt.data.views import SceneSample
@@ -39,8 +39,7 @@ def refuse_overlap(
     Training and evaluation scenes should be disjoint. If a scene is used for both, its evaluation targets must be
     held out of training; the number of such scenes is logged.
 
-    Scenes and places are compared by name, so the two sources may be of different types. A part of a mixture is
-    compared with the training part of the same name, or with all training data if there is none.
+    Scenes and places are compared by name, without the part of a mixture, so the two sources may be of different types.
 
     Args:
         train: the training source.
@@ -55,36 +54,28 @@ def refuse_overlap(
     targets: dict[str, set[int]] = {}
     for views in evaluation:
         targets.setdefault(views.scene, set()).update(views.target or views.context)
-    by_name, by_place = _named(train, scenes, lambda scene: scene), _named(train, scenes, train.place)
-    parts, shared = train.parts(), 0
+    by_name: dict[str, list[str]] = {}
+    by_place: dict[str, str] = {}
+    for scene in scenes:
+        by_name.setdefault(_without_part(train, scene, scene), []).append(scene)
+        by_place.setdefault(_without_part(train, scene, train.place(scene)), scene)
+    shared = 0
     for scene, frames in targets.items():
-        part = val.part(scene) if val.part(scene) in parts else None
-        same = by_name.get((part, _without_part(val, scene, scene)), ())
+        same = by_name.get(_without_part(val, scene, scene), ())
         for trained in same:
             _refuse_seen_targets(train, trained, scene, frames)
         shared += bool(same)
         place = _without_part(val, scene, val.place(scene))
-        if not same and (part, place) in by_place:
+        if not same and place in by_place:
             raise DataError(
-                f"evaluation scene {scene} and training scene {by_place[part, place][0]} show the same place "
-                f"({place}): give disjoint scenes, such as the lists that `vg2gt data splits` writes; if "
-                "they are different places, rename one"
+                f"evaluation scene {scene} and training scene {by_place[place]} show the same place ({place}): give "
+                "disjoint scenes, such as the lists that `vg2gt data splits` writes; if they are different places, "
+                "rename one"
             )
     if shared:
         log.info(
             "%d scenes are used for both training and evaluation; only frames held out of training are scored", shared
         )
-
-
-def _named(
-    source: SceneSource, scenes: Sequence[str], name: Callable[[str], str]
-) -> Mapping[tuple[str | None, str], list[str]]:
-    """Groups scenes by ``name(scene)``, under their part and under None, which stands for all parts."""
-    found: dict[tuple[str | None, str], list[str]] = {}
-    for scene in scenes:
-        for part in (source.part(scene), None):
-            found.setdefault((part, _without_part(source, scene, name(scene))), []).append(scene)
-    return found
 
 
 def _without_part(source: SceneSource, scene: str, name: str) -> str:

@@ -10,11 +10,11 @@ from PIL import Image
 from vg2gt.data import DataError
 from vg2gt.data.batches import BatchDataset
 from vg2gt.data.sources import COLMAP
-from vg2gt.data.sources.undistortion import pinhole_camera
+from vg2gt.data.sources.undistortion import undistortion_of
 from vg2gt.data.transforms import resize_to_cover
 from vg2gt.data.views import SceneSample
 from vg2gt.evaluation.checks import refuse_without_hints
-from vg2gt.geometry.cameras import resize_intrinsics, unproject
+from vg2gt.geometry.cameras import unproject
 from vg2gt.io import colmap_from_views, colmap_images, read_colmap, write_colmap
 from vg2gt.runs.load import load_model
 
@@ -52,45 +52,26 @@ def test_real_model_reprojects(statue):
     assert not source.is_metric
 
 
-def write_originals(statue, folder):
-    """Made again from the undistorted images: ``images/`` and the model of SIMPLE_RADIAL cameras."""
-    model = read_colmap(statue / "sparse" / "0")
-    (folder / "images").mkdir(parents=True)
-    write_colmap(folder / "sparse" / "0", model)
-    for image in colmap_images(model)[:4]:
-        camera, size = image.camera, (334, 505)
-        camera.rescale(size[1], size[0])
-        target = pinhole_camera(camera)
-        with Image.open(statue / "dense" / "0" / "images" / image.name) as picture:
-            pixels = np.array(picture.resize((target.width, target.height)))
-        y, x = np.mgrid[: size[0], : size[1]] + 0.5
-        rays = camera.cam_from_img(np.stack((x, y), -1).reshape(-1, 2))
-        places = target.img_from_cam(np.concatenate((rays, np.ones((len(rays), 1))), 1)).astype(int)
-        places = places.clip(0, [target.width - 1, target.height - 1])
-        Image.fromarray(pixels[places[:, 1], places[:, 0]].reshape(*size, 3)).save(folder / "images" / image.name)
-
-
-def test_a_distorted_model_beside_the_originals(statue, tmp_path):
-    """Item 16: COLMAP's default camera; what comes out is what COLMAP's own undistortion wrote."""
-    write_originals(statue, tmp_path / "statue")
+def test_distorted_images_are_undistorted_when_read(tmp_path):
+    """Item 16: COLMAP's default camera."""
+    frames = room(3)
+    write(tmp_path, frames)
+    model = read_colmap(tmp_path / "statue" / "sparse" / "0")
+    for camera in model.cameras.values():
+        fx, _, cx, cy = camera.params
+        camera.model, camera.params = "SIMPLE_RADIAL", [fx, cx, cy, 0.02]
+    write_colmap(tmp_path / "statue" / "sparse" / "0", model)
     source = COLMAP(str(tmp_path), depth="points")
-    (scene,) = source.scenes
-    index = source.scene_index(scene)
-    assert len(index.color) == 4
-    theirs = COLMAP(str(statue / "dense")).scene_index("0")
-    for row, path in enumerate(index.color):
-        other = [color.name for color in theirs.color].index(path.name)
-        np.testing.assert_allclose(index.world_to_camera[row], theirs.world_to_camera[other], atol=1e-9)
-        height, width = index.own_size(row)
-        full = theirs.own_size(other)
-        matrix = resize_intrinsics(torch.from_numpy(theirs.intrinsics[other]), width / full[1], height / full[0])
-        np.testing.assert_allclose(index.intrinsics[row], matrix.numpy(), rtol=6e-3)  # whole pixels
-        with Image.open(statue / "dense" / "0" / "images" / path.name) as picture:
-            expected = np.array(picture.resize((width, height)), np.float32) / 255
-        loaded = source.load_whole(scene, index.frame_ids[row]).images[0].permute(1, 2, 0).numpy()
-        assert np.abs(loaded - expected).mean() < 0.03
-    depth = source.load(scene, [index.frame_ids[0]]).depth[0]
-    assert (depth > 0).sum() > 50
+    index = source.scene_index("statue")
+    assert index.lens(1).startswith("SIMPLE_RADIAL 40 30")
+    undistortion = undistortion_of(index.lens(1))
+    assert index.own_size(1) == undistortion.size
+    assert np.array_equal(index.intrinsics[1], undistortion.intrinsics)
+    loaded = source.load_whole("statue", 1)
+    expected = undistortion.color(pixels(frames)[1])
+    assert np.array_equal(pixels(loaded)[0], expected)
+    assert np.abs(expected.mean() - pixels(frames)[1].mean()) < 10
+    assert (loaded.depth > 0).sum() > 0.7 * POINTS_A_VIEW
 
 
 def turned(orientation):
@@ -108,7 +89,7 @@ def test_the_larger_model_is_taken_and_the_other_named(tmp_path, caplog):
     two = cameras_of(frames).select(slice(2))
     write_colmap(scene / "sparse" / "0", colmap_from_views(two, ["left/000.png", "left/009.png"]))
     assert len(COLMAP(str(tmp_path)).frames("statue")) == 4
-    assert "has 2 COLMAP models: using sparse/1 with 4 images, ignoring sparse/0 (2)" in caplog.text
+    assert "has 2 COLMAP models: using sparse/1, the largest, ignoring sparse/0" in caplog.text
 
 
 @pytest.mark.parametrize("orientation", [3, 6, 8])

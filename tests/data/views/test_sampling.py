@@ -117,13 +117,11 @@ def test_scenes_that_are_too_short_are_counted_and_left_out(caplog):
     with caplog.at_level(logging.WARNING):
         assert usable_scenes(source, ViewSampler(2, 4), None) == ["room-000001", "room-000002"]
     assert "1 of 3 training scenes" in caplog.text
-    with pytest.raises(DataError, match=r"longest has 5 .* at most 3"):
-        usable_scenes(source, ViewSampler(6, 6, target_views=2), None)
-    with pytest.raises(DataError, match=r"longest has 5 that are not held out: lower data.target_views \(now 8\)"):
+    with pytest.raises(DataError, match=r"longest has 5 that are not held out: lower .*data.target_views \(now 8\)"):
         usable_scenes(source, ViewSampler(2, 2, target_views=8), None)
     source.frames = lambda scene: ()
-    with pytest.raises(DataError, match="longest has 0 that are not held out: use longer scenes"):
-        usable_scenes(source, ViewSampler(2, 2, target_views=8), None)
+    with pytest.raises(DataError, match="longest has 0 that are not held out"):
+        usable_scenes(source, ViewSampler(2, 2), None)
 
 
 def test_scenes_that_cannot_be_indexed_are_named_and_left_out(caplog):

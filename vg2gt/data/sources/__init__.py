@@ -5,7 +5,7 @@ from vg2gt.data.sources.infinigen import Infinigen
 from vg2gt.data.sources.kitti import KITTI
 from vg2gt.data.sources.nerfstudio import Nerfstudio
 from vg2gt.data.sources.replica import Replica
-from vg2gt.data.sources.scannet import ScanNet
+from vg2gt.data.sources.rgbd import ScanNet
 
 __all__ = [
     "COLMAP",

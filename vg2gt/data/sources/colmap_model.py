@@ -21,7 +21,6 @@ from vg2gt.data.sources.sparse_points import SparsePoints
 from vg2gt.data.sources.undistortion import posed_image, size_on_disk
 from vg2gt.io import colmap_images, colmap_pose, read_colmap
 from vg2gt.io.colmap import Image, Reconstruction, colmap_files
-from vg2gt.io.files import regular
 from vg2gt.io.image_files import Size, read_color
 
 log = logging.getLogger(__name__)
@@ -142,45 +141,33 @@ class COLMAP(FileSource):
         if not models:
             raise DataError(f"scene {scene} has no COLMAP model in {folder}: expected sparse/0 or sparse")
         if len(models) > 1:
-            others = ", ".join(f"{place.relative_to(folder)} ({count})" for place, count in models[1:])
-            log.warning(
-                "scene %s has %d COLMAP models: using %s with %d images, ignoring %s",
-                scene, len(models), models[0][0].relative_to(folder), models[0][1], others,
-            )  # fmt: skip
+            names = [str(place.relative_to(folder)) for place in models]
+            message = "scene %s has %d COLMAP models: using %s, the largest, ignoring %s"
+            log.warning(message, scene, len(models), names[0], ", ".join(names[1:]))
         with errors_name(scene):
-            return read_colmap(models[0][0]), models[0][0]
+            return read_colmap(models[0]), models[0]
 
 
-def models_of(folder: Path) -> list[tuple[Path, int]]:
-    """Returns the models at the first location that has any, with their number of images, largest first."""
+def models_of(folder: Path) -> list[Path]:
+    """Returns the models at the first location that has any; the one with the largest file of images comes first."""
     for name in _MODELS:
         place = folder / name
         if not place.is_dir() or (name == "." and not _has_images(place)):
             continue
         inside = sorted(path for path in place.iterdir() if path.name.isdigit()) if name != "." else []
-        found = [(path, _count_images(path)) for path in (*inside, place) if colmap_files(path)]
+        found = [path for path in (*inside, place) if colmap_files(path)]
         if found:
-            return sorted(found, key=lambda model: -model[1])
+            return sorted(found, key=lambda model: -colmap_files(model)["images"].stat().st_size)
     return []
 
 
 def model_folder_of(folder: Path) -> Path | None:
     """Returns the folder of a scene's largest model; None if there is none."""
-    return next((place for place, _ in models_of(folder)), None)
+    return next(iter(models_of(folder)), None)
 
 
 def _has_images(folder: Path) -> bool:
     return any(path.suffix.lower() in IMAGE_SUFFIXES or path.name == "images" for path in folder.iterdir())
-
-
-def _count_images(folder: Path) -> int:
-    """Returns the approximate number of images of a model, without parsing it."""
-    path = colmap_files(folder)["images"]
-    if path.suffix.lower() == ".bin":
-        with regular(path).open("rb") as file:
-            return int.from_bytes(file.read(8), "little")
-    with regular(path).open("rb") as file:
-        return sum(not line.lstrip().startswith(b"#") for line in file) // 2
 
 
 def _is_stored(model: Reconstruction, record: Image, path: Path) -> bool:

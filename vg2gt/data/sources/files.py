@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fnmatch
 import hashlib
 import json
 import logging
@@ -53,8 +52,8 @@ class FileSource(SceneSource):
 
     Args:
         root: the dataset's folder, or several.
-        scenes: names of the scenes to use, patterns of names (``Scene20/*``), or a text file with one per line; names
-            in a file that do not exist are skipped with a warning. None: all.
+        scenes: names of the scenes to use, or a text file with one per line; names in a file that do not exist are
+            skipped with a warning. None: all.
         holdout: hold out every ``holdout``-th frame as an evaluation target; None: none.
         every: use only every ``every``-th frame.
         index_cache: folder that caches the indices (file lists, poses, intrinsics); None: every process reads them from
@@ -257,15 +256,13 @@ class FileSource(SceneSource):
         if scenes is None:
             return found
         names = read_split(scenes) if isinstance(scenes, str) else list(scenes)
-        chosen = {name: fnmatch.filter(found, name) if "*" in name else [name] for name in names}
-        unknown = [name for name, fitting in chosen.items() if not fitting or fitting[0] not in found]
+        unknown = [name for name in names if name not in found]
         # A list file covers the whole dataset, but often only a part of it is on disk.
-        if unknown and (not isinstance(scenes, str) or len(unknown) == len(chosen)):
+        if unknown and (not isinstance(scenes, str) or len(unknown) == len(names)):
             raise DataError(f"no such scene: {_some(unknown)}; available: {_some(found)}")
         if unknown:
-            log.warning("skipped %d of the %d scenes listed in %s: not found", len(unknown), len(chosen), scenes)
-            chosen = {name: fitting for name, fitting in chosen.items() if name not in unknown}
-        return {scene: found[scene] for fitting in chosen.values() for scene in fitting}
+            log.warning("skipped %d of the %d scenes listed in %s: not found", len(unknown), len(names), scenes)
+        return {name: found[name] for name in names if name in found}
 
     def _recall_index(self, scene: str, folder: Path) -> SceneIndex:
         if self.index_cache is None:

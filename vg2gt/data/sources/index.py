@@ -126,7 +126,7 @@ def make_index(
     depth: Mapping[int, Path] | None,
     camera_to_world: Mapping[int, NDArray[np.float64]],
     intrinsics: NDArray[np.float64] | Mapping[int, NDArray[np.float64]],
-    color_size: Size | Mapping[int, Size] | None = None,
+    color_size: Size | None = None,
     size: Size | None = None,
     depth_size: Size | None = None,
     posed: Mapping[int, PosedImage] | None = None,
@@ -140,24 +140,26 @@ def make_index(
         depth: depth files by frame number; None if the scene has no depth.
         camera_to_world: 4x4 OpenCV poses by frame number; a pose that is not finite drops its frame.
         intrinsics: one ``[3, 3]`` for all frames, or one per frame number; image size as in ``SceneIndex``.
-        color_size: ``(height, width)`` of the colour files, or of each by frame number; None: size of the first file.
+        color_size: ``(height, width)`` of the colour files; None: size of the first file.
         size: size of decoded frames; None: that of the colour files, or their median if they differ.
         depth_size: size of the depth files; None: each has the size of its colour image.
         posed: image metadata by frame number, in place of ``intrinsics`` and ``color_size``.
     """
     if posed is not None:
         intrinsics = {i: image.intrinsics for i, image in posed.items()}
-        color_size = {i: image.size for i, image in posed.items()}
-    sizes = color_size if isinstance(color_size, Mapping) else None
-    if isinstance(color_size, Mapping):
-        size = size or typical_size(color_size.values())
-        color_size = size if set(color_size.values()) == {size} else None
+        sizes = [image.size for image in posed.values()]
+        size = size or typical_size(sizes)
+        color_size = size if set(sizes) == {size} else None
     else:
         check_found(name, folder, {"colour images": color})
         color_size = color_size or first_size(color, name)
         size = size or color_size
     where = f"{folder} (scene {name})"
-    _check_registered(where, color_size, depth_size)
+    if color_size and depth_size and abs(color_size[0] * depth_size[1] / (color_size[1] * depth_size[0]) - 1) > 0.02:
+        raise DataError(
+            f"colour ({color_size[1]}x{color_size[0]}) and depth ({depth_size[1]}x{depth_size[0]}) in {where} have "
+            "different aspect ratios: they are not registered"
+        )
     dropped: Counter[str] = Counter()
     kept = []
     for number in sorted(color):
@@ -182,12 +184,10 @@ def make_index(
     for reason, count in dropped.items():
         log.warning("scene %s: %d of %d frames %s are left out", name, count, len(listed), reason)
     extra: dict[str, NDArray] = {}
-    if sizes is not None:
-        extra["sizes"] = np.array([sizes[number] for number in kept], np.int64)
-    for key in ("lens", "upright", "mask"):
-        values = np.array([getattr(posed[number], key) for number in kept] if posed else [])
-        if any(values.tolist()):
-            extra[key] = values
+    if posed is not None:
+        extra = {key: np.array([getattr(posed[number], key) for number in kept]) for key in ("lens", "upright", "mask")}
+        extra = {key: values for key, values in extra.items() if any(values.tolist())}
+        extra["sizes"] = np.array([posed[number].size for number in kept], np.int64)
     poses = rigid(np.stack([camera_to_world[number] for number in kept]).astype(np.float64), kept, where)
     if isinstance(intrinsics, Mapping):
         matrices = np.stack([intrinsics[number] for number in kept]).astype(np.float64)
@@ -207,14 +207,6 @@ def make_index(
         dropped=dict(dropped),
         extra=extra,
     )
-
-
-def _check_registered(where: str, color: Size | None, depth: Size | None) -> None:
-    if color and depth and abs(color[0] * depth[1] / (color[1] * depth[0]) - 1) > 0.02:
-        raise DataError(
-            f"colour ({color[1]}x{color[0]}) and depth ({depth[1]}x{depth[0]}) in {where} have different aspect "
-            "ratios: they are not registered"
-        )
 
 
 def folder_state(folder: Path) -> str:

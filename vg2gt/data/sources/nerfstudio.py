@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +35,6 @@ log = logging.getLogger(__name__)
 
 FILE = "transforms.json"
 BLENDER = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
-_SCENES_IN_MEMORY = 64
 _MODELS = (None, "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
 
 
@@ -57,7 +57,7 @@ class Nerfstudio(FileSource):
 
     layout = f"{FILE}, or Blender's {', '.join(BLENDER)}, there or up to two folders deeper"
     names_are_paths = True
-    index_version = 3
+    index_version = 4
     index_options = ("has_depth",)
     reads_masks = True
     is_metric = False
@@ -71,7 +71,6 @@ class Nerfstudio(FileSource):
     ) -> None:
         self.has_depth = depth
         self.depth_scale = positive("depth_scale", depth_scale, "stored units per unit of the poses")
-        self._frames: dict[str, tuple[list[TransformsFrame], int]] = {}
         super().__init__(root, **shared)
 
     def is_scene(self, folder: Path) -> bool:
@@ -80,12 +79,13 @@ class Nerfstudio(FileSource):
 
     def held_out(self, scene: str) -> Sequence[int]:
         """Returns Blender's test frames if there are any, otherwise every ``holdout``-th frame."""
-        first_test = self._records(scene, self._folders[scene])[1]
-        return [frame for frame in self.frames(scene) if frame >= first_test] or super().held_out(scene)
+        index = self.scene_index(scene)
+        tests = index.extra.get("test", np.zeros(len(index.frame_ids), bool))
+        return [frame for frame in self.frames(scene) if tests[index.row(frame)]] or super().held_out(scene)
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
         """Reads the transforms and the sizes of the images."""
-        records = self._records(scene, folder)[0]
+        records, first_test = _records(scene, folder)
         where = f"{transforms_files(folder)[0]} of scene {scene}"
         with errors_name(scene):
             named = {i: _named_image(folder, record.file_path, where) for i, record in enumerate(records)}
@@ -98,7 +98,8 @@ class Nerfstudio(FileSource):
             raise DataError(f"scene {scene}: none of the {len(records)} images of {where} exists{tried}")
         poses = {i: to_world(np.asarray(record.world_to_camera, np.float64)) for i, record in enumerate(records)}
         posed = {i: _posed(scene, where, records[i].lens, path, masks.get(i)) for i, path in color.items()}
-        return make_index(scene, folder, color, depth if self.has_depth else None, poses, {}, posed=posed)
+        index = make_index(scene, folder, color, depth if self.has_depth else None, poses, {}, posed=posed)
+        return replace(index, extra={**index.extra, "test": np.array(index.frame_ids) >= first_test})
 
     def _masks(
         self, scene: str, folder: Path, records: Sequence[TransformsFrame], color: dict[int, Path], where: str
@@ -113,26 +114,23 @@ class Nerfstudio(FileSource):
         rest = {i: path.name for i, path in color.items() if i not in named}
         return found if named else find_masks(folder / MASKS, rest, f"scene {scene}")
 
-    def _records(self, scene: str, folder: Path) -> tuple[list[TransformsFrame], int]:
-        """Returns the frames in order, and the number of the first Blender test frame."""
-        if scene not in self._frames:
-            if len(self._frames) >= _SCENES_IN_MEMORY:
-                self._frames.clear()
-            frames, first_test = [], 0
-            for path in transforms_files(folder):
-                with errors_name(scene):
-                    own = read_transforms(path).frames
-                first_test = len(frames) if path.name == BLENDER[-1] else len(frames) + len(own)
-                frames += sorted(own, key=lambda frame: by_number(frame.file_path))
-            self._frames[scene] = frames, first_test
-        return self._frames[scene]
-
 
 def transforms_files(folder: Path) -> list[Path]:
     """Returns the ``transforms.json`` of a folder, or Blender's files."""
     if (folder / FILE).is_file():
         return [folder / FILE]
     return [folder / name for name in BLENDER if (folder / name).is_file()]
+
+
+def _records(scene: str, folder: Path) -> tuple[list[TransformsFrame], int]:
+    """Returns the frames in order, and the number of the first Blender test frame."""
+    frames, first_test = [], 0
+    for path in transforms_files(folder):
+        with errors_name(scene):
+            own = read_transforms(path).frames
+        first_test = len(frames) if path.name == BLENDER[-1] else len(frames) + len(own)
+        frames += sorted(own, key=lambda frame: by_number(frame.file_path))
+    return frames, first_test
 
 
 def _named_files(folder: Path, records: Sequence[TransformsFrame], field: str, where: str) -> dict[int, Path]:

@@ -204,18 +204,10 @@ def rigid(poses: NDArray[np.float64], frames: Sequence[int], where: str) -> NDAr
     return exact
 
 
-def to_world(world_to_camera: NDArray[np.float64], where: str | None = None, frame: int = 0) -> NDArray[np.float64]:
-    """Inverts a pose ``[4, 4]``; returns NaN, which drops the frame, if the pose is not finite.
-
-    Args:
-        world_to_camera: the pose.
-        where: the file or folder and the scene, for the message; the pose is made exactly rigid first (``rigid``).
-            None: the pose is known to be rigid.
-        frame: frame id of the pose, for the message.
-    """
-    if not (np.abs(world_to_camera) < 1e30).all():
-        return np.full((4, 4), np.nan)
-    return invert_pose(rigid(world_to_camera[None], [frame], where)[0] if where else world_to_camera)
+def to_world(world_to_camera: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Inverts a rigid pose ``[4, 4]``; returns NaN, which drops the frame, if it is not finite."""
+    finite = (np.abs(world_to_camera) < 1e30).all()
+    return invert_pose(world_to_camera) if finite else np.full((4, 4), np.nan)
 
 
 def pinhole(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:

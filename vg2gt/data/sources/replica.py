@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from typing_extensions import Unpack
 
@@ -14,12 +13,8 @@ from vg2gt.data.base import DataError
 from vg2gt.data.sources.files import FileSource, HoldoutOptions
 from vg2gt.data.sources.index import SceneIndex, check_found, first_size, make_index
 from vg2gt.data.sources.parsing import four_intrinsics, numbered, pinhole, read_numbers
-from vg2gt.geometry.cameras import resize_intrinsics
-from vg2gt.io.image_files import Size
 
 _SIZE = (680, 1200)
-_INTRINSICS = pinhole(600.0, 600.0, 599.5, 339.5)
-_LARGEST_STRETCH = 0.01
 
 
 class Replica(FileSource):
@@ -27,12 +22,11 @@ class Replica(FileSource):
 
     A scene has ``results/frameNNNNNN.jpg`` and ``results/depthNNNNNN.png`` (6553.5 units per metre, 0 = none). Line N
     of ``traj.txt`` holds the 16 numbers of the camera-to-world matrix of frame N (OpenCV, metres). Images are 1200x680
-    with a focal length of 600 and the principal point in the centre, (599.5, 339.5); the intrinsics of downsampled
-    copies are scaled.
+    with a focal length of 600 and the principal point in the centre, (599.5, 339.5).
 
     Args:
         root: the folder of the scenes, a single scene, or a list of these.
-        intrinsics: (fx, fy, cx, cy) in pixels of the images, if rendered with another camera; None: Replica's.
+        intrinsics: (fx, fy, cx, cy) in pixels of the images, if they have another size or camera; None: Replica's.
         shared: see ``FileSource``; a video has 2000 closely spaced frames.
     """
 
@@ -56,19 +50,14 @@ class Replica(FileSource):
         color, depth = (numbered(folder / "results", scene, f"{kind}*") for kind in ("frame", "depth"))
         check_found(scene, folder / "results", {"frame images": color, "depth images": depth})
         poses = _read_trajectory(folder / "traj.txt", scene, max(color))
-        intrinsics = self._intrinsics(folder, scene, first_size(color, scene))
-        return make_index(scene, folder, color, depth, poses, intrinsics)
-
-    def _intrinsics(self, folder: Path, scene: str, size: Size) -> NDArray[np.float64]:
-        if self.intrinsics is not None:
-            return pinhole(*self.intrinsics)
-        scale_x, scale_y = size[1] / _SIZE[1], size[0] / _SIZE[0]
-        if abs(scale_x / scale_y - 1) > _LARGEST_STRETCH:
+        size = first_size(color, scene)
+        if self.intrinsics is None and size != _SIZE:
             raise DataError(
-                f"the images of scene {scene} in {folder} are {size[1]}x{size[0]}, not 1200x680 or a reduced copy: "
-                "another camera rendered them; set data.intrinsics=[fx,fy,cx,cy]"
+                f"the images of scene {scene} in {folder} are {size[1]}x{size[0]}, not 1200x680: another camera "
+                "rendered them; set data.intrinsics=[fx,fy,cx,cy]"
             )
-        return resize_intrinsics(torch.from_numpy(_INTRINSICS), scale_x, scale_y).numpy()
+        intrinsics = pinhole(*(self.intrinsics or (600.0, 600.0, 599.5, 339.5)))
+        return make_index(scene, folder, color, depth, poses, intrinsics)
 
 
 def _read_trajectory(path: Path, scene: str, last: int) -> dict[int, NDArray[np.float64]]:

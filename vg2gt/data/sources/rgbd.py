@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from typing_extensions import Unpack
 
 from vg2gt.data.base import DataError
-from vg2gt.data.sources.files import FileOptions, FileSource
+from vg2gt.data.sources.files import FileOptions, FileSource, HoldoutOptions
 from vg2gt.data.sources.index import SceneIndex, check_found, first_size, make_index
 from vg2gt.data.sources.parsing import (
     check_intrinsics,
@@ -51,7 +51,6 @@ from vg2gt.data.sources.phone import (
     read_export,
     read_metres,
 )
-from vg2gt.data.sources.scannet import room_of_scan
 from vg2gt.geometry.cameras import resize_intrinsics
 from vg2gt.io.image_files import Size, check_size, read_depth
 from vg2gt.io.record3d import R3D
@@ -63,6 +62,7 @@ _INTRINSICS_FILES = ("K.txt", "camera-intrinsics.txt")
 _POSE_COLUMNS = {16: "4x4 camera-to-world", 12: "3x4", 7: "x y z qx qy qz qw", 8: "time and x y z qx qy qz qw"}
 _COLOR_FOLDERS = ("images", "color", "rgb", "image")
 _POSE_FOLDERS = ("pose", "poses")
+_FEW = 10  # a source with more recordings does not log each of them
 _OFF_CENTRE = 0.15  # maximum offset of the principal point from the centre, as a fraction of width or height
 
 
@@ -123,7 +123,7 @@ class RGBDFolder(FileSource):
         folder = self._folders[scene].resolve()
         if re.fullmatch(r"seq-\d+", folder.name):
             return folder.parent.name
-        return room_of_scan(folder.name) if re.fullmatch(r"scene\d{4}_\d\d", folder.name) else scene
+        return folder.name.split("_")[0] if re.fullmatch(r"scene\d{4}_\d\d", folder.name) else scene
 
     def watched(self, scene: str, folder: Path) -> Sequence[Path | None]:
         """Returns the folder, the possible intrinsics files in it and in its parent, and Polycam's ``keyframes``."""
@@ -142,7 +142,12 @@ class RGBDFolder(FileSource):
         index = make_index(
             scene, folder, found.color, depth, found.poses, matrices, found.color_size, size=size, depth_size=size
         )
-        _say(f"scene {scene}: {found.layout}, {len(index.frame_ids)} frames of {size[1]}x{size[0]} in {folder}")
+        if len(self.scenes) <= _FEW:
+            from_color = f", colour reduced from {found.color_size[1]}x{found.color_size[0]}"
+            _say(
+                f"scene {scene}: {found.layout}, {len(index.frame_ids)} frames of {size[1]}x{size[0]} in {folder}"
+                f"{from_color if found.color_size[0] > size[0] else ''}"
+            )
         return index
 
     def read_color(self, index: SceneIndex, row: int) -> NDArray[np.uint8]:
@@ -195,10 +200,35 @@ class RGBDFolder(FileSource):
         if self.intrinsics is None:
             known = [path for path in cameras if path.is_file()]
             intrinsics = _read_intrinsics(known, folder, scene, color_size, depth_size)
-        if color_size[0] > depth_size[0]:
-            larger, smaller = (f"{size[1]}x{size[0]}" for size in (color_size, depth_size))
-            _say(f"scene {scene}: colour of {larger} is reduced to the depth's {smaller}", logging.WARNING)
         return Recording(layout, color, depth, read, dict.fromkeys(color, intrinsics), color_size, depth_size)
+
+
+class ScanNet(RGBDFolder):
+    """Scans exported from ScanNet's ``.sens`` files; a scene is a scan such as ``scene0000_00``.
+
+    A scan has ``color/N.jpg`` (1296x968), ``depth/N.png`` (640x480, millimetres, 0 = none), ``pose/N.txt`` (4x4
+    camera-to-world) and ``intrinsic/intrinsic_depth.txt`` (4x4). Numbers are not padded. Frames with lost tracking have
+    a pose of -inf and are left out. Colour is registered to depth: it is resized to the depth images, whose intrinsics
+    are used. The extrinsics between the two cameras are the identity and are not read.
+
+    The arguments are those of ``FileSource``. ``root`` is ScanNet's folder, its ``scans``, a single scan, or a list of
+    these. ``scenes`` may be the official ``scannetv2_train.txt``. The frame rate is 30 frames per second.
+    """
+
+    layout = "sceneNNNN_NN/{color,depth,pose,intrinsic}, there or up to two folders deeper"
+    scene_files = ()
+    names_are_paths = False
+
+    def __init__(self, root: str | Sequence[str] | None, **shared: Unpack[HoldoutOptions]) -> None:
+        super().__init__(root, invalid=(), **{"holdout": None, **shared})
+
+    def is_scene(self, folder: Path) -> bool:
+        """Returns whether a folder contains all folders of a scan."""
+        return all((folder / name).is_dir() for name in ("color", "depth", "pose"))
+
+    def place(self, scene: str) -> str:
+        """Returns the room: ``scene0000`` for ``scene0000_00`` and ``scene0000_01``."""
+        return scene.split("_")[0]
 
 
 def _read_pose_list(path: Path, scene: str, frames: Sequence[int]) -> dict[int, NDArray[np.float64]]:

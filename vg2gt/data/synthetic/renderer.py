@@ -1,4 +1,4 @@
-"""Renders a world of textured parts with point lights and shadows: colour, exact z-depth and normals.
+"""Renders a world of textured parts with point lights and shadows: colour and exact z-depth.
 
 A numba kernel renders a frame and releases the GIL, so frames can be rendered in parallel threads. The image is
 processed in tiles: all rays of a tile are cast first, then shaded with the parts that can cast a shadow on the tile's
@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vg2gt.data.synthetic.raycast import FAR, find_occluder, jit, nearest_hit, part, parts_in_cone, surface, unowned
-from vg2gt.data.synthetic.sky import GROUND, add_sky
 from vg2gt.data.synthetic.textures import fractal_noise, pattern_value
 
 _TILE = 8
@@ -22,6 +21,12 @@ SAMPLES = 2  # colour samples per axis and pixel
 _LIFT = 1e-4  # metres by which a shadow ray starts above its surface
 _SHADOW = 0.2  # fraction of a light that reaches points in its shadow; approximates indirect light
 GAMMA = 1 / 1.8
+
+# Columns of a sky: linear colours at the horizon and the zenith; direction and glow of the sun; cover, frequency and
+# seed of the clouds.
+HORIZON, ZENITH, SUN, GLOW, CLOUDS, CLOUD_FREQUENCY, CLOUD_SEED, SKY_COLUMNS = 0, 3, 6, 9, 10, 11, 12, 13
+
+GROUND = -5  # hit of a ray that leaves an open world downwards (-1 - floor); all other walls are sky
 
 
 @dataclass(frozen=True)
@@ -40,7 +45,7 @@ class World:
         lights: ``[l, 6]`` position and colour.
         ambient: intensity of the ambient light.
         highlights: ``[m, 2]`` strength and Blinn-Phong exponent of the materials; None: no highlights.
-        sky: ``[SKY_COLUMNS]`` (columns: ``sky.py``), replaces the ceiling and the four walls; None: a closed world.
+        sky: ``[SKY_COLUMNS]`` (columns above), replaces the ceiling and the four walls; None: a closed world.
     """
 
     walls: NDArray[np.float64]
@@ -62,13 +67,10 @@ class RenderedFrame:
     Attributes:
         image: ``[H, W, 3]`` uint8.
         depth: ``[H, W]`` float32 z-depth in metres at the exact pixel centres, 0 in the sky.
-        normal: ``[H, W, 3]`` float32 unit normals in the camera frame at the pixel centres, facing the camera; 0 in
-            the sky.
     """
 
     image: NDArray[np.uint8]
     depth: NDArray[np.float32]
-    normal: NDArray[np.float32]
 
 
 def render_frame(
@@ -87,23 +89,15 @@ def render_frame(
         size: image ``(height, width)``.
         samples: colour samples per axis and pixel; 1 takes a third of the time of 2, but leaves jagged edges.
     """
-    frame = RenderedFrame(np.empty((*size, 3), np.uint8), np.empty(size, np.float32), np.empty((*size, 3), np.float32))
+    frame = RenderedFrame(np.empty((*size, 3), np.uint8), np.empty(size, np.float32))
     rotation = np.ascontiguousarray(world_to_camera[:3, :3])
     origin = -rotation.T @ world_to_camera[:3, 3]
     camera = (intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2])
     geometry = (world.parts, world.groups, world.walls)
     look = (world.part_materials, world.wall_materials, world.materials, world.lights, world.ambient)
-    out = (frame.image, frame.depth, frame.normal)
-    _render(
-        (origin, rotation),
-        camera,
-        geometry,
-        look,
-        (world.highlights, world.sky),
-        samples,
-        _workspace(world, samples),
-        out,
-    )
+    extras = (world.highlights, world.sky)
+    out = (frame.image, frame.depth)
+    _render((origin, rotation), camera, geometry, look, extras, samples, _workspace(world, samples), out)
     return frame
 
 
@@ -114,6 +108,31 @@ def _workspace(world: World, samples: int) -> tuple[tuple[NDArray, ...], ...]:
     seen = (np.empty(parts, np.int64), np.empty(parts))
     shadows = (np.empty((lights, parts), np.int64), np.zeros(lights, np.int64), np.full(lights, -1))
     return hits, seen, shadows, (np.empty(3), np.empty(3), np.empty(3))
+
+
+def draw_sky(rng: np.random.Generator, sun: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Draws a sky ``[SKY_COLUMNS]`` with the sun in unit direction ``sun`` ``[3]``."""
+    blue = rng.uniform((0.08, 0.2, 0.5), (0.2, 0.36, 0.8))
+    haze = rng.uniform((0.5, 0.58, 0.65), (0.75, 0.75, 0.8))
+    clouds = (rng.uniform(0.0, 1.2), rng.uniform(0.5, 1.5), rng.integers(1 << 20))
+    return np.array([*haze, *blue, *sun, rng.uniform(0.1, 0.5), *clouds])
+
+
+@part
+def add_sky(sky, d, angle, color):
+    """Adds the linear colour of the sky in unit direction ``d`` to ``color``; ``angle`` is the pixel width (rad)."""
+    height = max(d[2], 0.0)
+    blend = math.sqrt(height)
+    toward = max(d[0] * sky[SUN] + d[1] * sky[SUN + 1] + d[2] * sky[SUN + 2], 0.0)
+    glow = sky[GLOW] * (toward**8 + 4.0 * toward**400)
+    cover = 0.0
+    if height > 0.02 and sky[CLOUDS] > 0.0:  # clouds lie on a plane overhead and fade towards the horizon
+        u, v = d[0] / height, d[1] / height
+        noise = fractal_noise(u, v, sky[CLOUD_FREQUENCY], 5, angle / (height * height), int(sky[CLOUD_SEED]))
+        cover = min(max(sky[CLOUDS] * (noise + 0.1), 0.0), 1.0) * min(6.0 * height, 1.0)
+    for i in range(3):
+        clear = sky[HORIZON + i] + blend * (sky[ZENITH + i] - sky[HORIZON + i])
+        color[i] += clear + cover * (0.9 - clear) + glow
 
 
 @part
@@ -215,26 +234,18 @@ def _shade(hit, t, p, d, footprint, parts, look, highlights, sky, shadowing, cou
 
 
 @part
-def _cast_centers(tile, origin, rotation, camera, geometry, sky, seen, d, out):
-    """Writes depth and normals of a tile at the pixel centres; overwrites ``d``."""
+def _cast_centers(tile, origin, rotation, camera, geometry, sky, seen, d, depth):
+    """Writes the depth of a tile at the pixel centres; overwrites ``d``."""
     parts, _, walls = geometry
     visible, near, count = seen
-    _, depth, normal = out
     y0, x0, y1, x1 = tile
     ox, oy, oz = origin[0], origin[1], origin[2]
     for y in range(y0, y1):
         for x in range(x0, x1):
             z = _ray(float(x), float(y), rotation, camera, d)
             t, hit = nearest_hit(visible, near, count, parts, walls, ox, oy, oz, d[0], d[1], d[2])
-            if sky is not None and hit < 0 and hit != GROUND:
-                depth[y, x] = 0.0
-                for i in range(3):
-                    normal[y, x, i] = 0.0
-                continue
-            n = surface(hit, parts, ox + t * d[0], oy + t * d[1], oz + t * d[2])
-            depth[y, x] = t * z
-            for i in range(3):
-                normal[y, x, i] = rotation[i, 0] * n[0] + rotation[i, 1] * n[1] + rotation[i, 2] * n[2]
+            in_sky = sky is not None and hit < 0 and hit != GROUND
+            depth[y, x] = 0.0 if in_sky else t * z
 
 
 @part
@@ -270,8 +281,7 @@ def _render(pose, camera, geometry, look, extras, samples, workspace, out):
     highlights, sky = unowned(extras)
     rays, (visible, near), (shadowing, counts, guesses), (axis, color, ray) = unowned(workspace)
     points, directions, distances, hits = rays
-    out = unowned(out)
-    image = out[0]
+    image, depth = unowned(out)
     height, width = image.shape[:2]
     per_pixel = samples * samples
     for y0 in range(0, height, _TILE):
@@ -281,7 +291,7 @@ def _render(pose, camera, geometry, look, extras, samples, workspace, out):
             count = parts_in_cone(origin, axis, spread, FAR / 2, parts, groups, visible, near)
             seen = (visible, near, count)
             tile = (y0, x0, y1, x1)
-            _cast_centers(tile, origin, rotation, camera, geometry, sky, seen, ray, out)
+            _cast_centers(tile, origin, rotation, camera, geometry, sky, seen, ray, depth)
             k = _cast_samples(tile, samples, origin, rotation, camera, geometry, seen, rays)
             if sky is not None:
                 _leave_out_sky(hits, points, k, origin)

@@ -105,11 +105,6 @@ class SyntheticScenes(SceneSource):
             intrinsics.contiguous(),
         )
 
-    def normals(self, scene: str, frame_ids: Sequence[int]) -> torch.Tensor:
-        """Renders exact unit normals ``[V, 3, H, W]`` in the camera frame, 0 in the sky. They are not cached."""
-        frames = self.scene(scene).render(frame_ids, _threads())
-        return torch.from_numpy(np.stack([frame.normal for frame in frames])).permute(0, 3, 1, 2).contiguous()
-
     def scene(self, scene: str) -> SyntheticScene:
         """Builds a scene, ready for rendering."""
         kind, seed = self._seeds[scene]

@@ -230,16 +230,10 @@ def _nothing_usable(
     where = f" of {part}" if part else ""
     unread = f" ({damaged} scenes cannot be read, see the warnings)" if damaged else ""
     longest = max(inside, default=0)
-    views = longest - sampler.target_views
-    if views >= 1:
-        remedy = f"set data.max_views and data.min_views to at most {views}, or lower data.target_views"
-    elif longest > 1 and sampler.target_views:
-        remedy = f"lower data.target_views (now {sampler.target_views}), and data.max_views and data.min_views with it"
-    else:
-        remedy = "use longer scenes, or hold fewer frames out (data.holdout)"
     return DataError(
         f"none of {len(inside)} training scenes{where} has {sampler.frames_needed} frames (max_views + target_views)"
-        f"{unread}; the longest has {longest} that are not held out: {remedy}"
+        f"{unread}; the longest has {longest} that are not held out: lower data.max_views and data.min_views, or "
+        f"data.target_views (now {sampler.target_views}), or use longer scenes"
     )
 
 
