@@ -26,28 +26,13 @@ def record3d_metadata(frames: Frames) -> dict[str, Any]:
     return {"w": SIZE[1], "h": SIZE[0], "poses": poses, "K": [fx, 0, 0, 0, fy, 0, cx, cy, 1], "fps": 60}
 
 
-def write_record3d(root: Path, frames: Frames, per_frame: bool = False) -> None:
-    """``EXR + JPG``; one channel of float32, named as the first renderer at hand would name it."""
-    import OpenEXR  # pyright: ignore[reportMissingImports]: optional
-
-    folder = root / "sofa" / "EXR_RGBD"
-    (folder / "depth").mkdir(parents=True)
-    header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
-    for i, image in enumerate(pixels(frames)):
-        save(folder / "rgb" / f"{i}.jpg", image)
-        depth = np.ascontiguousarray(frames.depth[i].numpy())
-        OpenEXR.File(header, {"R": depth}).write(str(folder / "depth" / f"{i}.exr"))
-    content, own = record3d_metadata(frames), [(camera_of(frames) + CORNER).tolist()] * len(frames.images)
-    if per_frame:
-        content |= {"K": [1.0, 0, 0, 0, 1, 0, 0, 0, 1], "perFrameIntrinsicCoeffs": own}
-    (folder / "metadata.json").write_text(json.dumps(content))
-
-
 def write_r3d(root: Path, frames: Frames, packed: bool = True, told: bool = True) -> None:
     """Record3D's own: a ZIP of JSON without an ending, and depth and confidence in LZFSE."""
     import lzfse  # pyright: ignore[reportMissingImports]: optional
 
+    own = [(camera_of(frames) + CORNER).tolist()] * len(frames.images)
     content = record3d_metadata(frames)
+    content |= {"K": [1.0, 0, 0, 0, 1, 0, 0, 0, 1], "perFrameIntrinsicCoeffs": own} if not packed else {}
     content |= {"dw": SIZE[1], "dh": SIZE[0], "initPose": [0, 0, 0, 1, 0, 0, 0]} if told else {}
     files = {"metadata": json.dumps(content).encode(), "icon": b"a picture", "sound.m4a": b"a sound"}
     for i in range(len(frames.images)):
@@ -104,8 +89,6 @@ LAYOUTS = {
     "polycam": Layout(write_polycam, READ, image_error=0.012, frame_ids=POLYCAM_IDS),
     "stray_scanner": Layout(write_stray, READ, image_error=0.03),
 }
-if importlib.util.find_spec("OpenEXR"):
-    LAYOUTS["record3d"] = Layout(write_record3d, READ, image_error=0.012, depth_quantum=1e-6)
 if importlib.util.find_spec("lzfse"):
     unpacked = partial(write_r3d, packed=False, told=False)
     LAYOUTS["r3d"] = Layout(write_r3d, READ, image_error=0.012, depth_quantum=1e-6)

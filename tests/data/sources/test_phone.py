@@ -1,7 +1,5 @@
 """What the round trips of capture apps' exports do not show: coarser depth, confidence, choices of files, messages."""
 
-import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +11,7 @@ from vg2gt.data import RGBDFolder
 from vg2gt.io import FormatError
 from vg2gt.io.video import read_frame, read_video
 
-from .layout_phone import write_polycam, write_record3d, write_stray
+from .layout_phone import write_polycam, write_stray
 from .layouts import SIZE, room, save
 
 
@@ -37,30 +35,6 @@ def test_depth_is_coarser_and_not_to_be_trusted_everywhere(tmp_path: Path) -> No
     expected[:, :2] /= 2
     expected[:, :2, 2] -= 0.25  # the middle of the first pixel is at 0, of however many it was made
     torch.testing.assert_close(loaded.intrinsics, expected.float(), atol=1e-4, rtol=0)
-
-
-def test_record3d_knows_every_frames_intrinsics(tmp_path: Path) -> None:
-    pytest.importorskip("OpenEXR")
-    frames = room(2)
-    write_record3d(tmp_path, frames, per_frame=True)
-    (scene,) = RGBDFolder(str(tmp_path)).scenes
-    loaded = RGBDFolder(str(tmp_path)).load(scene, [1])
-    torch.testing.assert_close(loaded.intrinsics[0], frames.intrinsics[1], atol=1e-4, rtol=0)
-
-
-def test_without_openexr_the_remedy_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_stray(tmp_path, room(2))
-    folder = tmp_path / "71de12f9"
-    for name in ("odometry.csv", "camera_matrix.csv"):
-        (folder / name).unlink()
-    shutil.move(folder / "rgb.mp4", tmp_path / "rgb.mp4")
-    save(folder / "rgb" / "0.jpg", np.zeros((*SIZE, 3), np.uint8))
-    (folder / "depth" / "0.exr").write_bytes(b"")
-    camera = {"w": SIZE[1], "h": SIZE[0], "poses": [[0, 0, 0, 1, 0, 0, 0]], "K": [30, 0, 0, 0, 30, 0, 20, 15, 1]}
-    (folder / "metadata.json").write_text(json.dumps(camera))
-    monkeypatch.setitem(__import__("sys").modules, "OpenEXR", None)
-    with pytest.raises(ImportError, match=r"0\.exr is read with OpenEXR: pip install 'vg2gt\[phone\]'"):
-        RGBDFolder(str(folder)).frames("71de12f9")
 
 
 def test_frames_of_a_video_are_found_alone(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import hashlib
 import json
 import logging
 from abc import abstractmethod
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import ClassVar, TypedDict
@@ -106,9 +106,8 @@ class FileSource(SceneSource):
         self.every = every
         self.index_cache = expanded(index_cache)
         self._folders = self._select(self._find_all(_roots(root, self.layout, self.scene_files)), scenes)
-        self._indices: OrderedDict[str, SceneIndex] = OrderedDict()
+        self._indices: dict[str, SceneIndex] = {}
         self._frame_ids: dict[str, NDArray[np.int64]] = {}
-        self._indexes = False
 
     def is_scene(self, folder: Path) -> bool:
         """Returns whether a folder is a scene; by default, whether it contains all ``scene_marks``."""
@@ -208,11 +207,10 @@ class FileSource(SceneSource):
         if scene not in self._folders:
             raise DataError(f"no such scene: {scene}; available: {_some(self._folders)}")
         if scene not in self._indices:
+            # Indices of a thousand long videos would take gigabytes; forgotten ones are quickly read from the cache.
+            if self.index_cache is not None and len(self._indices) >= _INDICES_IN_MEMORY:
+                self._indices.clear()
             self._indices[scene] = self._recall_index(scene, self._folders[scene])
-            # Indices of a thousand long videos would take gigabytes; evicted ones are quickly read from the cache.
-            if self.index_cache is not None and len(self._indices) > _INDICES_IN_MEMORY:
-                self._indices.popitem(last=False)
-        self._indices.move_to_end(scene)
         return self._indices[scene]
 
     def _load_frame(self, index: SceneIndex, row: int, whole: bool = False) -> Frames:
@@ -268,19 +266,17 @@ class FileSource(SceneSource):
         if self.index_cache is None:
             return self.index(scene, folder)
         options = {name: getattr(self, name) for name in self.index_options}
-        version = (FORMAT, self.index_version)
-        key = json.dumps([type(self).__qualname__, version, str(folder.resolve()), scene, options], default=str)
-        digest = hashlib.sha256(key.encode()).hexdigest()[:24]
-        path = self.index_cache / "index" / f"{digest}.npz"
-        state = " ".join(folder_state(place) for place in self.watched(scene, folder) if place and place.exists())
-        index = read_index(path, scene, folder, state)
+        state = [folder_state(place) for place in self.watched(scene, folder) if place and place.exists()]
+        version = (type(self).__qualname__, FORMAT, self.index_version)
+        key = json.dumps([version, str(folder.resolve()), scene, options, state], default=str)
+        path = self.index_cache / "index" / f"{hashlib.sha256(key.encode()).hexdigest()[:24]}.npz"
+        index = read_index(path, scene, folder)
         if index is None:
-            if not self._indexes:
-                self._indexes = True
+            if not self._frame_ids:
                 message = "reading file lists, poses and intrinsics of up to %d scenes; they are cached in %s"
                 log.info(message, len(self._folders), self.index_cache)
             index = self.index(scene, folder)
-            write_cached(path, index_to_bytes(index, state), self.index_cache)
+            write_cached(path, index_to_bytes(index), self.index_cache)
         return index
 
 

@@ -23,7 +23,7 @@ from vg2gt.io.image_files import Size, image_size, typical_size
 
 log = logging.getLogger(__name__)
 
-FORMAT = 3
+FORMAT = 4
 """Version of the index files; increment it when their format changes."""
 _SIZES = ("size", "color_size", "depth_size")
 
@@ -229,11 +229,10 @@ def _folders_in(folder: Path) -> list[Path]:
         return sorted(Path(entry.path) for entry in entries if entry.is_dir())
 
 
-def index_to_bytes(index: SceneIndex, state: str) -> bytes:
-    """Serialises an index and the state of its folder as an ``.npz`` file."""
-    facts = {"state": state, "dropped": dict(index.dropped), "extra": list(index.extra)}
+def index_to_bytes(index: SceneIndex) -> bytes:
+    """Serialises an index as an ``.npz`` file."""
+    facts = {"dropped": dict(index.dropped), "extra": list(index.extra)}
     facts |= {name: getattr(index, name) for name in _SIZES}
-    shared = (index.intrinsics == index.intrinsics[:1]).all()
     buffer = io.BytesIO()
     np.savez_compressed(
         buffer,
@@ -242,14 +241,14 @@ def index_to_bytes(index: SceneIndex, state: str) -> bytes:
         color=_names(index.color, index.folder),
         depth=_names(index.depth, index.folder),
         world_to_camera=index.world_to_camera,
-        intrinsics=index.intrinsics[:1] if shared else index.intrinsics,
+        intrinsics=index.intrinsics,
         **{f"extra_{name}": array for name, array in index.extra.items()},  # pyright: ignore[reportArgumentType]
     )
     return buffer.getvalue()
 
 
-def read_index(path: Path, scene: str, folder: Path, state: str) -> SceneIndex | None:
-    """Reads a cached index; None if it is missing or damaged, or if the folder's state has changed."""
+def read_index(path: Path, scene: str, folder: Path) -> SceneIndex | None:
+    """Reads a cached index; None if it is missing or, with a warning, damaged."""
     if not path.is_file():
         return None
     try:
@@ -259,8 +258,6 @@ def read_index(path: Path, scene: str, folder: Path, state: str) -> SceneIndex |
     except (DataError, ValueError) as error:
         log.warning("the cached index is damaged and will be rebuilt: %s", error)
         return None
-    if facts["state"] != state:
-        return None
     return SceneIndex(
         name=scene,
         folder=folder,
@@ -268,7 +265,7 @@ def read_index(path: Path, scene: str, folder: Path, state: str) -> SceneIndex |
         color=tuple(folder / name for name in arrays["color"].tolist()),
         depth=tuple(folder / name for name in arrays["depth"].tolist()),
         world_to_camera=arrays["world_to_camera"],
-        intrinsics=np.broadcast_to(arrays["intrinsics"], (len(arrays["frame_ids"]), 3, 3)).copy(),
+        intrinsics=arrays["intrinsics"],
         dropped=facts["dropped"],
         extra={name: arrays[f"extra_{name}"] for name in facts["extra"]},
         **{name: facts[name] and tuple(facts[name]) for name in _SIZES},

@@ -68,11 +68,6 @@ def read_poses(files: Mapping[int, Path], scene: str) -> dict[int, NDArray[np.fl
         return dict(zip(files, poses, strict=True))
 
 
-def pose_file_of(folder: Path) -> Path | None:
-    """Returns the file of all poses in a recording's folder, if there is one."""
-    return next((folder / name for name in ("poses.txt", "pose.txt") if (folder / name).is_file()), None)
-
-
 def pose_matrices(rows: NDArray[np.float64]) -> NDArray[np.float64]:
     """Converts rows to poses ``[n, 4, 4]``: a 4x4 or 3x4 matrix, or x y z qx qy qz qw, optionally after a timestamp.
 

@@ -2,8 +2,7 @@
 
 The app is detected from the files present:
 
-* Record3D, exported as *EXR + JPG*: ``metadata.json``, ``rgb/N.jpg``, ``depth/N.exr`` (metres);
-* Record3D's own ``.r3d``, packed or unpacked: ``metadata``, ``rgbd/N.jpg``, ``rgbd/N.depth`` (metres), ``rgbd/N.conf``;
+* Record3D's ``.r3d``, packed or unpacked: ``metadata``, ``rgbd/N.jpg``, ``rgbd/N.depth`` (metres), ``rgbd/N.conf``;
 * Polycam, *raw data*: ``keyframes/images/N.jpg``, ``keyframes/cameras/N.json``, ``keyframes/depth/N.png`` (mm); with
   optimised cameras, ``corrected_images/`` and ``corrected_cameras/``;
 * Stray Scanner: ``rgb.mp4``, ``depth/N.png`` (mm), ``odometry.csv``, ``camera_matrix.csv``.
@@ -28,23 +27,18 @@ from vg2gt.data.sources.parsing import (
     errors_name,
     numbered,
     pinhole,
-    pose_file_of,
     pose_matrices,
 )
 from vg2gt.io.errors import FormatError
-from vg2gt.io.files import regular
-from vg2gt.io.image_files import Size, check_size, image_size, read_color
+from vg2gt.io.image_files import Size, image_size, read_color
 from vg2gt.io.json_checks import load_json
 from vg2gt.io.record3d import is_archive, read_recorded, recorded_files, unpack_lzfse
 from vg2gt.io.video import video_size
 
-METRES = (".exr", ".depth")
-"""Suffixes of depth files that store floats in metres."""
-EXR, PACKED = METRES
+PACKED = ".depth"
+"""Suffix of depth files that store compressed floats in metres."""
 VIDEO = "rgb.mp4"
-RECORD3D, R3D, POLYCAM, STRAY = (
-    f"export of {app}" for app in ("Record3D", "Record3D (.r3d)", "Polycam", "Stray Scanner")
-)
+RECORD3D, POLYCAM, STRAY = (f"export of {app}" for app in ("Record3D", "Polycam", "Stray Scanner"))
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # from ARKit's camera axes to OpenCV's
 
 
@@ -71,29 +65,14 @@ class Recording:
     recorded: Size | None = None
 
     def depth_size(self, scene: str) -> Size:
-        """Returns ``(height, width)`` of the depth: ``recorded``, or that of the first file.
-
-        Raises:
-            DataError: if the file cannot be read.
-            ImportError: if a required package is not installed.
-        """
-        if self.recorded is not None:
-            return self.recorded
-        path = next(iter(self.depth.values()))
-        if path.suffix.lower() != EXR:
-            return image_size(path, scene)
-        with errors_name(scene):
-            height, width = _read_exr(path).shape
-        return height, width
+        """Returns ``(height, width)`` of the depth: ``recorded``, or that of the first file."""
+        return self.recorded or image_size(next(iter(self.depth.values())), scene)
 
 
 def app_of(folder: Path) -> str | None:
     """Detects the app that exported a folder or archive; None if it is no such export."""
-    own_poses = pose_file_of(folder) is not None or (folder / "pose").is_dir() or (folder / "poses").is_dir()
-    if (folder / "metadata.json").is_file() and (folder / "rgb").is_dir() and not own_poses:
-        return RECORD3D
     if is_archive(folder) or ((folder / "metadata").is_file() and (folder / "rgbd").is_dir()):
-        return R3D
+        return RECORD3D
     if (folder / "keyframes" / "cameras").is_dir():
         return POLYCAM
     return STRAY if (folder / "odometry.csv").is_file() and (folder / VIDEO).is_file() else None
@@ -106,7 +85,7 @@ def read_export(folder: Path, scene: str) -> Recording | None:
         DataError: if it is damaged.
         ImportError: if a required package is not installed, such as PyAV for videos.
     """
-    readers = {RECORD3D: _read_record3d, R3D: _read_r3d, POLYCAM: _read_polycam, STRAY: _read_stray}
+    readers = {RECORD3D: _read_record3d, POLYCAM: _read_polycam, STRAY: _read_stray}
     app = app_of(folder)
     with errors_name(scene):
         return readers[app](folder, scene) if app is not None else None
@@ -126,36 +105,17 @@ def read_color_file(path: Path, scene: str, size: Size | None) -> NDArray[np.uin
 
 
 def read_metres(path: Path, scene: str, size: Size) -> NDArray[np.float32]:
-    """Reads a depth file ``[H, W]`` in one of the ``METRES`` formats; 0 where depth is invalid or its ``.conf`` is 0.
+    """Reads a ``PACKED`` depth file ``[H, W]``; 0 where depth is invalid or the confidence in its ``.conf`` is 0.
 
     Raises:
         DataError: if the file is missing, damaged or of another size.
         ImportError: if a required package is not installed.
     """
     with errors_name(scene):
-        depth = _read_exr(path) if path.suffix.lower() == EXR else _unpacked(path, np.dtype("<f4"), size)
-        if path.suffix.lower() == PACKED:
-            with suppress(FileNotFoundError):
-                depth = np.where(_unpacked(path.with_suffix(".conf"), np.dtype(np.uint8), size) > 0, depth, 0)
-    check_size(path, scene, depth.shape, size)
+        depth = _unpacked(path, np.dtype("<f4"), size)
+        with suppress(FileNotFoundError):
+            depth = np.where(_unpacked(path.with_suffix(".conf"), np.dtype(np.uint8), size) > 0, depth, 0)
     return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
-
-
-def _read_exr(path: Path) -> NDArray[np.float32]:
-    """Reads the first float channel by name of an EXR image ``[H, W]``."""
-    try:
-        import OpenEXR  # pyright: ignore[reportMissingImports]: optional
-    except ImportError as error:
-        raise ImportError(f"{path.name} is read with OpenEXR: pip install 'vg2gt[phone]'") from error
-    try:
-        with OpenEXR.File(str(regular(path)), separate_channels=True) as file:
-            channels = {name: channel.pixels for name, channel in file.channels().items()}
-    except (RuntimeError, ValueError) as error:  # raised by its C++ side for damaged files
-        raise FormatError(f"{path}: not an OpenEXR image ({error}); the file is truncated or damaged") from error
-    floats = [pixels for _, pixels in sorted(channels.items()) if pixels.ndim == 2 and pixels.dtype.kind == "f"]
-    if not floats:
-        raise FormatError(f"{path}: expected a channel of floats, found {', '.join(channels) or 'none'}")
-    return np.asarray(floats[0], np.float32)
 
 
 def _unpacked(path: Path, kind: np.dtype[Any], size: Size) -> NDArray[Any]:
@@ -166,22 +126,14 @@ def _unpacked(path: Path, kind: np.dtype[Any], size: Size) -> NDArray[Any]:
     return np.frombuffer(content, kind).reshape(size)
 
 
-def _read_record3d(folder: Path, scene: str) -> Recording:
-    """Reads a Record3D export with separate files."""
-    path = folder / "metadata.json"
-    color, depth = numbered(folder / "rgb", scene), numbered(folder / "depth", scene, suffixes=(EXR,))
-    size = image_size(next(iter(color.values())), scene) if color else (0, 0)
-    return _of_metadata(RECORD3D, path, load_json(path), color, depth, size)
-
-
-def _read_r3d(recording: Path, scene: str) -> Recording:
+def _read_record3d(recording: Path, scene: str) -> Recording:
     """Reads a ``.r3d``; older files lack the depth size, which is then derived from the images' aspect ratio."""
     path = recording / "metadata"
     content = load_json(path, read_recorded(path))
     color, depth = recorded_files(recording, ".jpg"), recorded_files(recording, PACKED)
     first = next(iter(color.values()), None)
     size = image_size(first, scene, content=read_recorded(first)) if first else (0, 0)
-    export = _of_metadata(R3D, path, content, color, depth, size)
+    export = _of_metadata(path, content, color, depth, size)
     if not (color and depth):
         return export
     if "dh" in content and "dw" in content:
@@ -194,10 +146,8 @@ def _read_r3d(recording: Path, scene: str) -> Recording:
     return replace(export, recorded=(height, width))
 
 
-def _of_metadata(
-    app: str, path: Path, content: Any, color: dict[int, Path], depth: dict[int, Path], size: Size
-) -> Recording:
-    """Parses Record3D metadata: ``poses`` as qx qy qz qw x y z; column-major ``K``, or coefficients per frame."""
+def _of_metadata(path: Path, content: Any, color: dict[int, Path], depth: dict[int, Path], size: Size) -> Recording:
+    """Parses the metadata: ``poses`` as qx qy qz qw x y z; column-major ``K``, or coefficients per frame."""
     height, width = _numbers(path, content, "h", "w")
     if color and not np.isclose(height * size[1], width * size[0], rtol=0.02):
         raise FormatError(f"{path} gives a size of {width:g}x{height:g} pixels, but the images are {size[1]}x{size[0]}")
@@ -211,7 +161,7 @@ def _of_metadata(
         raise FormatError(f"{path}: expected poses and intrinsics as Record3D writes them ({error})") from error
     scale = np.diag([size[1] / width, size[0] / height, 1.0])
     return Recording(
-        app,
+        RECORD3D,
         color,
         depth,
         poses={i: pose @ _OPENGL for i, pose in enumerate(pose_matrices(rows[:, [4, 5, 6, 0, 1, 2, 3]]))},

@@ -34,7 +34,6 @@ from vg2gt.data.sources.parsing import (
     four_intrinsics,
     numbered,
     pinhole,
-    pose_file_of,
     pose_matrices,
     positive,
     read_matrix,
@@ -42,7 +41,7 @@ from vg2gt.data.sources.parsing import (
     read_poses,
 )
 from vg2gt.data.sources.phone import (
-    METRES,
+    PACKED,
     VIDEO,
     Recording,
     app_of,
@@ -59,6 +58,7 @@ from vg2gt.io.video import read_frame
 log = logging.getLogger(__name__)
 
 _INTRINSICS_FILES = ("K.txt", "camera-intrinsics.txt")
+_POSE_FILES = ("poses.txt", "pose.txt")
 _POSE_COLUMNS = {16: "4x4 camera-to-world", 12: "3x4", 7: "x y z qx qy qz qw", 8: "time and x y z qx qy qz qw"}
 _COLOR_FOLDERS = ("images", "color", "rgb", "image")
 _POSE_FOLDERS = ("pose", "poses")
@@ -85,7 +85,7 @@ class RGBDFolder(FileSource):
 
     layout = (
         "images/, color/, rgb/ or image/ with depth/, poses.txt and K.txt, or frame-*.color.png with "
-        "frame-*.depth.png, or an export of Record3D (.r3d, EXR + JPG), Polycam (raw data) or Stray Scanner, there or "
+        "frame-*.depth.png, or an export of Record3D (.r3d), Polycam (raw data) or Stray Scanner, there or "
         "up to two folders deeper"
     )
     scene_files = (R3D,)
@@ -163,7 +163,7 @@ class RGBDFolder(FileSource):
     def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
         """Decodes depth: floats in metres, or integers in units of ``depth_scale``; 0 where the confidence is 0."""
         path = index.depth[row]
-        if path.suffix.lower() in METRES:
+        if path.suffix.lower() == PACKED:
             return read_metres(path, index.name, size)
         depth = super().read_depth(index, row, size)
         confidence = confidence_of(path)
@@ -175,7 +175,8 @@ class RGBDFolder(FileSource):
             images = next((folder / name for name in _COLOR_FOLDERS if (folder / name).is_dir()), folder)
             color, depth = numbered(images, scene), numbered(folder / "depth", scene)
             pose_folder = next((folder / name for name in _POSE_FOLDERS if (folder / name).is_dir()), None)
-            poses = numbered(pose_folder, scene, suffixes=(".txt",)) if pose_folder else pose_file_of(folder)
+            pose_file = next((folder / name for name in _POSE_FILES if (folder / name).is_file()), None)
+            poses = numbered(pose_folder, scene, suffixes=(".txt",)) if pose_folder else pose_file
             cameras = [*_exported_intrinsics(folder), *_beside(folder)]
             layout = f"folders {images.name}/ and depth/" if depth else f"images in {images.name}/"
         else:
