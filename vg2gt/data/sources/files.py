@@ -87,8 +87,6 @@ class FileSource(SceneSource):
     """Stored depth units per unit of the poses."""
     invalid: tuple[int, ...] = ()
     """Stored depth values that are invalid, in addition to 0."""
-    depth_remedy: ClassVar[str] = "correct the depth unit and the values that mean 'invalid'"
-    """Remedy named in the error about a frame without valid depth."""
 
     def __init__(
         self,
@@ -235,7 +233,7 @@ class FileSource(SceneSource):
         if not (depth > 0).any():
             raise DataError(
                 f"{index.depth[row]} of scene {index.name} has no valid depth in any pixel; remove the frame, or "
-                f"{self.depth_remedy}"
+                "correct the depth unit, the values that mean 'invalid', or the range (data.max_depth)"
             )
         return depth
 

@@ -53,7 +53,6 @@ class Infinigen(FileSource):
     layout = "SCENE/frames/{Image,Depth,camview}/camera_0, there or up to two folders deeper"
     scene_marks = ("frames/Image/camera_0",)
     names_are_paths = True
-    depth_remedy = "raise data.max_depth, beyond which points have no depth (nor has the sky)"
 
     def __init__(
         self,

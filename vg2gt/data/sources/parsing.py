@@ -217,24 +217,17 @@ def check_intrinsics(intrinsics: NDArray[np.float64], where: str) -> NDArray[np.
         intrinsics: ``[..., 3, 3]`` matrices.
         where: the file or folder and the scene, for the message.
     """
-    focal, lower = intrinsics[..., [0, 1], [0, 1]], intrinsics[..., [1, 2, 2], [0, 0, 1]]
+    focal, zeros = intrinsics[..., [0, 1], [0, 1]], intrinsics[..., [0, 1, 2, 2], [1, 0, 0, 1]]
+    first = intrinsics.reshape(-1, 3, 3)[0].tolist()
     if not ((np.abs(intrinsics) < _LARGEST).all() and (focal > 0).all()):
-        raise DataError(f"the intrinsics in {where} have no positive focal lengths: {intrinsics.tolist()}")
-    small = _NO_SKEW * focal[..., 0]
-    if not ((np.abs(lower) <= small[..., None]).all() and (np.abs(intrinsics[..., 2, 2] - 1) < 1e-6).all()):
+        raise DataError(f"the intrinsics in {where} have no positive focal lengths: {first}")
+    is_pinhole = (np.abs(zeros) <= _NO_SKEW * focal[..., :1]).all() and (np.abs(intrinsics[..., 2, 2] - 1) < 1e-6).all()
+    if not (is_pinhole and (np.abs(intrinsics[..., :2, 2]) <= _FAR_OFF * focal).all()):
         raise DataError(
-            f"the intrinsics in {where} are not fx 0 cx, 0 fy cy, 0 0 1 (transposed, or another matrix?): "
-            f"{_first(intrinsics)}"
+            f"the intrinsics in {where} are not fx 0 cx, 0 fy cy, 0 0 1 (transposed, with skew, which is not modelled, "
+            f"or a principal point far outside?): {first}"
         )
-    if not (np.abs(intrinsics[..., 0, 1]) <= small).all():
-        raise DataError(f"the intrinsics in {where} have skew, which is not modelled: {_first(intrinsics)}")
-    if not (np.abs(intrinsics[..., :2, 2]) <= _FAR_OFF * focal).all():
-        raise DataError(f"the principal point of the intrinsics in {where} is far outside: {_first(intrinsics)}")
     return intrinsics
-
-
-def _first(matrices: NDArray[np.float64]) -> list[list[float]]:
-    return matrices.reshape(-1, 3, 3)[0].tolist()
 
 
 def four_intrinsics(intrinsics: Sequence[float] | None) -> tuple[float, ...] | None:
