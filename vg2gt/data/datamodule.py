@@ -124,18 +124,16 @@ class SceneDataModule(LightningDataModule):
         error, because metrics must not change silently.
 
         Raises:
-            DataError: if data is missing, unusable, or shared by training and evaluation; with ``stage="fit"`` also
-                if the training scenes have no cameras.
+            DataError: if data is missing, unusable, or shared by training and evaluation, or if the training scenes
+                have no cameras.
         """
         if self._train is not None and self._val is not None:
             return
         if self.eval_scenes == 0:
             raise DataError("data.eval_scenes=0 leaves no scene to evaluate: it must be at least 1, or null for all")
         train, val = self.train_source(), self.val_source()
-        trainable = train.has_cameras
-        if stage == "fit":
-            refuse_untrainable(train)
-        self._train_names = usable_scenes(train, self.sampler, self.train_scenes) if trainable else []
+        refuse_untrainable(train)
+        self._train_names = usable_scenes(train, self.sampler, self.train_scenes)
         names = list(val.scenes)[: self.eval_scenes]
         self._val_views = [views for name in names for views in self.eval_views.choose(val, name)]
         refuse_overlap(train, self._train_names, val, self._val_views)
@@ -159,15 +157,9 @@ class SceneDataModule(LightningDataModule):
         return self._source(self._make_val)
 
     def train_dataloader(self) -> DataLoader[Batch]:
-        """Returns batches from the trainer's current step on; one item of the loader is one batch.
-
-        Raises:
-            DataError: if the training scenes have no cameras.
-        """
+        """Returns batches from the trainer's current step on; one item of the loader is one batch."""
         self.setup()
         assert self._train is not None
-        if not self._train.source.has_cameras:
-            refuse_untrainable(self._train.source)
         trainer = self.trainer
         sampler = StepSampler(
             self._train.source,

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from typing_extensions import Unpack
 
 from vg2gt.data.base import DataError
-from vg2gt.data.sources.files import FileOptions, FileSource, HoldoutOptions
+from vg2gt.data.sources.files import FileOptions, FileSource
 from vg2gt.data.sources.index import SceneIndex, check_found, first_size, make_index
 from vg2gt.data.sources.parsing import (
     check_intrinsics,
@@ -220,8 +220,10 @@ class ScanNet(RGBDFolder):
     scene_files = ()
     names_are_paths = False
 
-    def __init__(self, root: str | Sequence[str] | None, **shared: Unpack[HoldoutOptions]) -> None:
-        super().__init__(root, invalid=(), **{"holdout": None, **shared})
+    def __init__(
+        self, root: str | Sequence[str] | None, holdout: int | None = None, **shared: Unpack[FileOptions]
+    ) -> None:
+        super().__init__(root, invalid=(), holdout=holdout, **shared)
 
     def is_scene(self, folder: Path) -> bool:
         """Returns whether a folder contains all folders of a scan."""
