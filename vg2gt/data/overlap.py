@@ -62,8 +62,13 @@ def refuse_overlap(
     shared = 0
     for scene, frames in targets.items():
         same = by_name.get(_without_part(val, scene, scene), ())
-        for trained in same:
-            _refuse_seen_targets(train, trained, scene, frames)
+        for seen in (frames - set(train.held_out(trained)) for trained in same):
+            if seen:
+                raise DataError(
+                    f"scene {scene} is used for training and for evaluation: {len(seen)} of its evaluation frames are "
+                    "not held out of training; give disjoint scenes, such as the lists that `vg2gt data splits` "
+                    "writes, or hold frames out of training (data.holdout); if they are different scenes, rename one"
+                )
         shared += bool(same)
         place = _without_part(val, scene, val.place(scene))
         if not same and place in by_place:
@@ -82,13 +87,3 @@ def _without_part(source: SceneSource, scene: str, name: str) -> str:
     """Removes the prefix ``<part>/`` that a mixture adds to the name of a scene or place."""
     part = source.part(scene)
     return name.removeprefix(f"{part}/") if part else name
-
-
-def _refuse_seen_targets(train: SceneSource, trained: str, scene: str, frames: set[int]) -> None:
-    seen = frames - set(train.held_out(trained))
-    if seen:
-        raise DataError(
-            f"scene {scene} is used for training and for evaluation: {len(seen)} of its evaluation frames are not held "
-            "out of training; give disjoint scenes, such as the lists that `vg2gt data splits` writes, or "
-            "hold frames out of training (data.holdout); if they are different scenes, rename one"
-        )

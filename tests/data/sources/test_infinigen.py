@@ -66,11 +66,12 @@ def test_frames_are_numbered_by_what_varies(tmp_path):
         write_view(tmp_path / "video", f"0_0_{frame:04d}_0")
     for rig in (2, 10, 1):
         write_view(tmp_path / "rigs", f"{rig}_0_0048_0", shift=rig)
-    for name in ("0_0_0001_0", "0_0_0002_0", "3_0_0001_0"):
+    for name in ("0_10_0001_0", "0_2_0001_0", "0_0_0002_0", "3_0_0001_0"):
         write_view(tmp_path / "both", name)
     source = Infinigen(str(tmp_path))
     assert (source.frames("video"), source.frames("rigs")) == ((9, 10, 100), (1, 2, 10))
     assert source.frames("both") == (1, 2, 300_001)
+    assert source.scene_index("both").color[0].name == "Image_0_2_0001_0.png"  # of the first resample
     assert source.load("rigs", [10, 2]).world_to_camera[:, 0, 3].tolist() == [-10, -2]
 
 

@@ -255,7 +255,14 @@ def _read_intrinsics(files: Sequence[Path], folder: Path, scene: str, color: Siz
     path = next((path for path in files if path.name == "intrinsic_depth.txt"), files[0])
     size = depth if path.name == "intrinsic_depth.txt" else color
     matrix = read_matrix(path, scene, ((3, 3), (4, 4)))[:3, :3]
-    _check_resolution(matrix, f"{path} of scene {scene}", size)
+    check_intrinsics(matrix, f"{path} of scene {scene}")
+    x, y = matrix[0, 2], matrix[1, 2]
+    if abs(x / size[1] - 0.5) > _OFF_CENTRE or abs(y / size[0] - 0.5) > _OFF_CENTRE:
+        raise DataError(
+            f"{path} of scene {scene} has its principal point at ({x:g}, {y:g}), far from the middle of the images of "
+            f"{size[1]}x{size[0]}; it seems to be for another resolution (about {2 * x:.0f}x{2 * y:.0f}): scale it to "
+            "these images, or set data.intrinsics=[fx,fy,cx,cy], which is used unchanged"
+        )
     return _resized(matrix, size, color)
 
 
@@ -264,18 +271,6 @@ def _resized(matrix: NDArray[np.float64], size: Size, target: Size) -> NDArray[n
     if size == target:
         return matrix
     return resize_intrinsics(torch.from_numpy(matrix), target[1] / size[1], target[0] / size[0]).numpy()
-
-
-def _check_resolution(matrix: NDArray[np.float64], where: str, size: Size) -> None:
-    """Raises if the principal point is far off centre, which means intrinsics of another image resolution."""
-    check_intrinsics(matrix, where)
-    x, y = matrix[0, 2], matrix[1, 2]
-    if abs(x / size[1] - 0.5) > _OFF_CENTRE or abs(y / size[0] - 0.5) > _OFF_CENTRE:
-        raise DataError(
-            f"{where} has its principal point at ({x:g}, {y:g}), far from the middle of the images of "
-            f"{size[1]}x{size[0]}; it seems to be for another resolution (about {2 * x:.0f}x{2 * y:.0f}): scale it to "
-            "these images, or set data.intrinsics=[fx,fy,cx,cy], which is used unchanged"
-        )
 
 
 @lru_cache

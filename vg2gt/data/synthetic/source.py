@@ -119,7 +119,8 @@ class SyntheticScenes(SceneSource):
 
     def _render(self, scene: str) -> dict[str, NDArray]:
         made = self.scene(scene)
-        frames = made.render(range(self.num_frames), _threads())
+        threads = 1 if torch.utils.data.get_worker_info() is not None else torch.get_num_threads()
+        frames = made.render(range(self.num_frames), threads)
         return {
             "images": np.stack([frame.image for frame in frames]),
             "depth": np.stack([frame.depth for frame in frames]),
@@ -159,8 +160,3 @@ class SyntheticScenes(SceneSource):
         buffer = io.BytesIO()
         np.savez(buffer, **arrays)  # pyright: ignore[reportArgumentType]
         write_cached(path, buffer.getvalue(), self.cache_dir)
-
-
-def _threads() -> int:
-    """Returns the number of rendering threads: 1 in a loader worker, otherwise all threads of this process."""
-    return 1 if torch.utils.data.get_worker_info() is not None else torch.get_num_threads()

@@ -211,8 +211,17 @@ def usable_scenes(source: SceneSource, sampler: ViewSampler, limit: int | None) 
     usable = [scene for scene, length in lengths.items() if length >= sampler.frames_needed]
     short, damaged = len(lengths) - len(usable), len(scenes) - len(lengths)
     for part in dict.fromkeys(source.part(scene) for scene in scenes):
-        if not any(source.part(scene) == part for scene in usable):
-            raise _nothing_usable(source, part, lengths, sampler, damaged)
+        if any(source.part(scene) == part for scene in usable):
+            continue
+        inside = [length for scene, length in lengths.items() if source.part(scene) == part]
+        where = f" of {part}" if part else ""
+        unread = f" ({damaged} scenes cannot be read, see the warnings)" if damaged else ""
+        raise DataError(
+            f"none of {len(inside)} training scenes{where} has {sampler.frames_needed} frames (max_views + "
+            f"target_views){unread}; the longest has {max(inside, default=0)} that are not held out: lower "
+            f"data.max_views and data.min_views, or data.target_views (now {sampler.target_views}), or use longer "
+            "scenes"
+        )
     if short:
         log.warning(
             "%d of %d training scenes have fewer than %d frames and are not used",
@@ -221,20 +230,6 @@ def usable_scenes(source: SceneSource, sampler: ViewSampler, limit: int | None) 
     if damaged:
         log.warning("%d of %d training scenes cannot be read and are not used", damaged, len(scenes))
     return usable
-
-
-def _nothing_usable(
-    source: SceneSource, part: str, lengths: Mapping[str, int], sampler: ViewSampler, damaged: int
-) -> DataError:
-    inside = [length for scene, length in lengths.items() if source.part(scene) == part]
-    where = f" of {part}" if part else ""
-    unread = f" ({damaged} scenes cannot be read, see the warnings)" if damaged else ""
-    longest = max(inside, default=0)
-    return DataError(
-        f"none of {len(inside)} training scenes{where} has {sampler.frames_needed} frames (max_views + target_views)"
-        f"{unread}; the longest has {longest} that are not held out: lower data.max_views and data.min_views, or "
-        f"data.target_views (now {sampler.target_views}), or use longer scenes"
-    )
 
 
 @dataclass(eq=False)
