@@ -108,7 +108,7 @@ def test_a_gpus_allocator_grows_its_segments(tmp_path: Path, own: str | None, mo
 def test_long_presets_evaluate_while_they_train(tmp_path: Path, name: str) -> None:
     config = composed(tmp_path, f"experiment={name}")
     assert config.trainer.max_steps / config.trainer.val_check_interval >= 10
-    assert config.callbacks.checkpoint.monitor == "eval/psnr"
+    assert config.callbacks.best.monitor == "eval/psnr"
 
 
 @pytest.mark.parametrize("name", group_options("refine"))

@@ -144,7 +144,7 @@ def after_seconds(seconds: float) -> Moment:
 
 def while_a_checkpoint_is_written(attempt: Attempt) -> bool:
     """A checkpoint has only its temporary name."""
-    return any(name.endswith(".ckpt.tmp") for name in attempt.new())
+    return any(name.startswith("checkpoints/") and name.endswith(".tmp") for name in attempt.new())
 
 
 def after_a_checkpoint(attempt: Attempt) -> bool:

@@ -18,9 +18,9 @@ from tests.reliability.degenerate import SCENES
 from tests.reliability.steps import TINY, first_batches, tiny_run
 from tests.training_helpers import SMALL
 from vg2gt.losses import EnhancementLoss, GaussianLoss, ScaleAlignment, VG2GTLoss
+from vg2gt.training.checkpointing import StopOnSignal
 from vg2gt.training.distributed import interleave
 from vg2gt.training.loop import Run
-from vg2gt.training.stop_on_signal import StopOnSignal
 from vg2gt.types import Batch
 
 # --------------------------------------------------------------------------------------------- scenes count alike
@@ -221,10 +221,10 @@ class Announced(lightning.Callback):
 
 def test_the_announced_end_of_a_job_saves_after_the_step(tmp_path: Path, cache: Path) -> None:
     run = tiny_run(tmp_path, cache, "trainer.max_steps=5")
-    run.trainer.callbacks += [StopOnSignal(str(tmp_path)), Announced()]  # pyright: ignore[reportAttributeAccessIssue]
+    run.trainer.callbacks += [StopOnSignal(), Announced()]  # pyright: ignore[reportAttributeAccessIssue]
     before = signal.getsignal(signal.SIGUSR1)
     run.trainer.fit(run.module, datamodule=run.datamodule)
-    assert [path.name for path in tmp_path.glob("*.ckpt")] == ["step-2.ckpt"]
+    assert [path.name for path in tmp_path.rglob("*.ckpt")] == ["step-2.ckpt"]
     assert signal.getsignal(signal.SIGUSR1) == before
 
 

@@ -34,7 +34,7 @@ ATTACKS: dict[str, Attack] = {
     "a function of ours": lambda c: {"_target_": "vg2gt.io.files.write_text", "path": c, "content": ""},
     "training": lambda c: {"_target_": "vg2gt.training.loop.train", "config": {"output_dir": c}},
     "a method of ours": lambda c: {"_target_": "vg2gt.uncertainty.calibration.Calibration.write", "path": c},
-    "a class that writes": lambda c: {"_target_": "vg2gt.training.stop_on_signal.StopOnSignal", "folder": c},
+    "a class that writes": lambda c: {"_target_": "vg2gt.training.checkpointing.StopOnSignal", "folder": c},
     "a list": lambda c: [{"_target_": "os.mkdir", "path": c}],  # pyright: ignore[reportAssignmentType]
 }  # fmt: skip
 
@@ -106,13 +106,15 @@ def test_a_runs_configuration_is_plain(run_folder, canary, name, monkeypatch):
     assert str(path) in str(caught.value)
 
 
-@pytest.mark.parametrize("read", [name_differences, lambda config: _refuse_other_run(config, Path(config.output_dir))])
+@pytest.mark.parametrize(
+    "read", [lambda config, run: name_differences(config, run / "checkpoints" / "last"), _refuse_other_run]
+)
 def test_no_command_reads_the_environment_for_a_runs_configuration(read, run_folder, monkeypatch, caplog):
     monkeypatch.setenv("SECRET", "hunter2")
     with (run_folder / "config.yaml").open("a") as file:
         file.write("${oc.env:SECRET}: 1\nx: ${oc.env:SECRET}\n")
     with caplog.at_level(logging.DEBUG), pytest.raises(UntrustedError, match="an interpolation") as caught:
-        read(OmegaConf.create({"output_dir": str(run_folder)}))
+        read(OmegaConf.create({"output_dir": str(run_folder)}), run_folder)
     assert "hunter2" not in caplog.text + str(caught.value)
 
 

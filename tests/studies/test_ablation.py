@@ -4,6 +4,7 @@ import json
 import re
 import shlex
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ import vg2gt.studies.ablation
 import vg2gt.studies.study
 from tests.commands import printed
 from tests.training_helpers import SMALL
+from vg2gt.config import compose
 from vg2gt.evaluation.tables import METRICS
 from vg2gt.runs.checkpoints import newest_valid, read_checkpoint, write_checkpoint
 from vg2gt.studies.ablation import CONTROL, FULL, Ablation, _verdict, common_overrides, continuations
@@ -21,8 +23,12 @@ from vg2gt.studies.study import paired_difference
 QUIET = [override for override in SMALL if not override.startswith("trainer.max_steps")]
 
 
-def study(folder: Path, cache: Path, *overrides: str, steps: int = 1, splits: tuple[int, ...] = (1, 2)) -> Ablation:
-    return Ablation(folder, [*QUIET, f"data.cache_dir={cache}", *overrides], 1, 2, steps, 1e-4, ["wo_split"], splits)
+def study(folder: Path, cache: Path, *overrides: str, common: Sequence[str] = QUIET, **own: object) -> Ablation:
+    """A study of one variant, of one seed; ``own`` are keys of ``ablate.yaml``."""
+    keys = {"seeds": 1, "full_steps": 2, "steps": 1, "lr": 1e-4, "variants": "[wo_split]", "splits": "[1,2]"} | own
+    given = [*common, *([f"data.cache_dir={cache}"] if common is QUIET else []), *overrides]
+    own_keys = [f"{key}={value}" for key, value in keys.items()]
+    return Ablation(compose("ablate", f"output_dir={folder}", *own_keys, *given), given)
 
 
 def unpadded(report: str) -> str:
@@ -46,11 +52,10 @@ def folder(tmp_path: Path, finished: Path) -> Path:
 
 
 def test_every_row_is_run_once() -> None:
-    names = [run.name for run in continuations(["wo_depth", "wo_split"], [1, 2, 3, 4], full_splits=2)]
+    names = list(continuations(["wo_depth", "wo_split"], [1, 2, 3, 4], full_splits=2))
     assert names == [FULL, "wo_depth", "wo_split", "splits=3", "splits=4", CONTROL]
-    names = [run.name for run in continuations([], [1, 2], full_splits=4)]
-    assert names == [FULL, "splits=1", "splits=2", CONTROL]
-    assert [run.name for run in continuations(["wo_depth"], [2], full_splits=2)] == [FULL, "wo_depth"]
+    assert list(continuations([], [1, 2], full_splits=4)) == [FULL, "splits=1", "splits=2", CONTROL]
+    assert list(continuations(["wo_depth"], [2], full_splits=2)) == [FULL, "wo_depth"]
 
 
 def test_results_and_tables(finished: Path) -> None:
@@ -121,8 +126,8 @@ def test_other_settings_are_refused(finished: Path, cache: Path) -> None:
 def test_results_of_another_full_model_are_not_taken(folder: Path, cache: Path) -> None:
     """The full model's folder was deleted, as the message says, and trained longer: its continuations are stale."""
     shutil.rmtree(folder / "seed-0" / "start")
-    longer = Ablation(folder, [*QUIET, f"data.cache_dir={cache}"], 1, 3, 1, 1e-4, ["wo_split"], (1, 2))
-    with pytest.raises(ValueError, match=r"full holds a run that started from other weights"):
+    longer = study(folder, cache, full_steps=3)
+    with pytest.raises(ValueError, match=r"full holds a run with other settings \(the weights in init_from\)"):
         longer.run()
     assert longer.results[FULL] == {}
 
@@ -180,33 +185,16 @@ def test_verdicts() -> None:
     assert verdict({0: {"psnr": 27.0}}, "psnr") == "+2.00"
 
 
-def test_only_full_models_begin_with_given_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The others begin with the full model of their seed."""
-    begun: dict[str, list[str]] = {}
-
-    def noted(overrides: list[str], folder: Path, scored: bool) -> dict[str, float]:
-        begun[folder.name] = [override for override in overrides if override.startswith("init_from=")]
-        return {"psnr": 20.0}
-
-    monkeypatch.setattr(vg2gt.studies.ablation, "run_once", noted)
-    monkeypatch.setattr(vg2gt.studies.ablation, "final_checkpoint", lambda folder, steps: folder / "end.ckpt")
-    some = Ablation(tmp_path, QUIET, 1, 2, 1, 1e-4, ["wo_coarse"], [2], init_from="begin.ckpt")
-    some.run()
-    assert begun["start"] == ["init_from='begin.ckpt'"]
-    assert begun["wo_coarse"] == begun["full"] == [f"init_from='{tmp_path / 'seed-0' / 'start' / 'end.ckpt'}'"]
-    assert "Full model 2 steps from begin.ckpt, then every row" in some.report()
-
-
 def test_given_weights_on_a_protocol(finished: Path, tmp_path: Path, cache: Path, monkeypatch) -> None:
     """Without a step of training: every variant of the given weights is scored as ``vg2gt evaluate`` scores it."""
     monkeypatch.setattr(vg2gt.studies.study, "train", lambda config: pytest.fail(f"trained {config.output_dir}"))
     given = newest_valid(finished / "seed-0" / "start" / "checkpoints")
     scenes = ["views=2", "data.image_size=[28,56]", "data.eval_scenes=1", "data.num_frames=8"]
     scenes += [f"data.cache_dir={cache}", "evaluation.selection.index=null"]
-    overrides = [override for override in QUIET if not override.startswith("data.")]
-    overrides += ["data=replica", "data.root=/nowhere"]  # the training's data is not needed
-    arguments = (tmp_path, overrides, 1, 0, 0, 1e-4, ["wo_split"], (2,), str(given))
-    some = Ablation(*arguments, "synthetic", scenes)
+    own = {"full_steps": 0, "steps": 0, "splits": "[2]", "init_from": given, "protocol": "synthetic"}
+    bare = [override for override in QUIET if not override.startswith("data.")]
+    bare += ["data=replica", "data.root=/nowhere"]  # the training's data is not needed
+    some = study(tmp_path, cache, common=bare, **own, protocol_overrides=scenes)
     some.run()
     for run in (FULL, "wo_split"):
         report = json.loads((tmp_path / "seed-0" / run / "synthetic" / "metrics.json").read_text())
@@ -218,10 +206,9 @@ def test_given_weights_on_a_protocol(finished: Path, tmp_path: Path, cache: Path
         assert torch.equal(weights["model.gaussians.hidden.weight"], kept["model.gaussians.hidden.weight"])
     assert some.results["wo_split"][0]["gaussians"] < 0.7 * some.results[FULL][0]["gaussians"]
     assert "as in vg2gt evaluate evaluation=synthetic views=2" in some.report()
+    assert f"Full model 0 steps from {given}, then every row" in some.report()
     with pytest.raises(ValueError, match=r"protocol_overrides: views=\[3, 10\].*give one number"):
-        Ablation(*arguments, "synthetic", ["views=[3,10]"])
-    with pytest.raises(ValueError, match="Could not find 'evaluation/replicas'"):
-        Ablation(*arguments, "replicas")
+        study(tmp_path, cache, **own, protocol_overrides=["views=[3,10]"])
 
 
 def test_what_the_study_decides_cannot_be_overridden() -> None:
@@ -231,8 +218,7 @@ def test_what_the_study_decides_cannot_be_overridden() -> None:
         common_overrides(["trainer.max_steps=7"])
 
 
-def test_numbers_are_checked_first(tmp_path: Path) -> None:
-    right = {"seeds": 1, "full_steps": 1, "steps": 1, "lr": 1e-3, "variants": [], "splits": [2]}
-    for name, value in (("seeds", 0), ("seeds", "abc"), ("steps", 1.5), ("full_steps", -1), ("splits", [0])):
+def test_numbers_are_checked_first(tmp_path: Path, cache: Path) -> None:
+    for name, value in (("seeds", 0), ("seeds", "abc"), ("steps", 1.5), ("full_steps", -1)):
         with pytest.raises(ValueError, match=f"{name}=.*: a study takes whole numbers from [01] on"):
-            Ablation(tmp_path, [], **(right | {name: value}))
+            study(tmp_path, cache, **{name: value})

@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import shlex
 import shutil
 import signal
@@ -132,46 +131,31 @@ def everything_in(folder: Path) -> dict[Path, bytes]:
 REFUSED: list[tuple[list[str], str | None]] = [
     (["debug=fast_dev_run", "model.gaussians.max_offset=3"], None),
     (["debug=fast_dev_run", "ckpt=last", "backend.seed=1"], "trained on backbone"),
-    (["ckpt=last", "backend.seed=1"], "trained on backbone"),
     (["ckpt=last", "backend.taps=1"], r"step-4\.ckpt was trained with backend\.taps=4, but this run uses 1"),
     (["ckpt=last", "model.gaussians.splits=4"], r"first mismatch: model\.gaussians\.out"),
-    (
-        ["ckpt=last", "optimizer=adamw", "trainer.max_steps=6"],
-        r"trained with vg2gt\.training\.muon\.MuonAdamW and cannot resume with torch\.optim\.AdamW",
-    ),
+    (["ckpt=last", "optimizer=adamw"], r"optimizer\._target_=torch\.optim\.AdamW differs from vg2gt\.training\.muon"),
     (["ckpt=last", "optimizer.lr=0.001"], r"optimizer\.lr=0\.001 differs from 0\.004.*optimiser's state.*init_from="),
-    (["ckpt=last", "optimizer.momentum=0.5"], r"optimizer\.momentum=0\.5 differs from 0\.8"),
     (["ckpt=last", "training.part=coarse"], r"training\.part=coarse differs from all"),
-    (["ckpt=last", "training.coarse_lr_factor=1"], r"training\.coarse_lr_factor=1 differs from 0\.4"),
     (["ckpt=auto", "trainer.max_steps=3"], r"step-4\.ckpt is at step 4, beyond trainer\.max_steps=3; nothing"),
-    (["overwrite=true", "data.train_scenes=0"], r"data\.train_scenes=0 must be at least 1"),
-    (["overwrite=true", "data.workers=-1"], r"data\.workers=-1 must be at least 0"),
-    (["overwrite=true", "optimizer.lr=-1"], r"optimizer: Invalid learning rate: -1"),
     *(
-        (["overwrite=true", override], re.escape(override) + ".*" + remedy)
-        for override, remedy in {
-            "loss.geometry=null": r"loss\.geometry\.depth=0",
-            "loss.enhance=null": r"loss\.enhance\.weight=0",
-            "loss.gaussian=null": r"loss\.gaussian\.weight=0",
-            "loss.align=null": "enhanced, rendered or initial",
+        (["overwrite=true", override], message)
+        for override, message in {
+            "data.train_scenes=0": r"data\.train_scenes=0 must be at least 1",
+            "data.workers=-1": r"data\.workers=-1 must be at least 0",
+            "data.eval_scenes=0": r"data\.eval_scenes=0.*at least 1, or null for all",
+            "data.memory_mb=-1": r"data\.memory_mb=-1.*at least 0",
+            "optimizer.lr=-1": r"optimizer: Invalid learning rate: -1",
+            "optimizer.lr=0": r"optimizer\.lr=0.*a positive number",
+            "loss.geometry=null": r"loss\.geometry=null does not turn anything off",
             "loss.geometry.quantile=0": "greater than 0 and at most 1",
-            "loss.geometry.quantile=1.5": "greater than 0 and at most 1",
-            "training.render_views=0": "at least 1, or null for all",
-            "training.warmup_steps=-1": "0 for no warm-up",
-            "training.final_lr=0": "a positive number",
-            "optimizer.lr=0": "a positive number",
-            "trainer.gradient_clip_val=-1": "null for no clipping",
-            "trainer.max_steps=-1": "set one of them",
-            "trainer.val_check_interval=0": "a positive number of steps",
-            "data.eval_scenes=0": "at least 1, or null for all",
-            "data.eval_scenes=-1": "at least 1, or null for all",
-            "data.memory_mb=-1": "at least 0",
+            "training.render_views=0": r"training\.render_views=0.*at least 1, or null for all",
+            "trainer.val_check_interval=0": r"trainer\.val_check_interval=0: give a large number",
+            "+trainer.accumulate_grad_batches=2": "accumulate",
+            "+trainer.gradient_clip_algorithm=value": "use norm",
+            "init_from=.": r"init_from=\.: no valid checkpoint in",
+            "init_from=nowhere.ckpt": r"init_from=nowhere\.ckpt: no such checkpoint or run",
         }.items()
     ),
-    (["overwrite=true", "init_from=."], r"init_from=\. holds no valid checkpoint"),
-    (["overwrite=true", "init_from=nowhere.ckpt"], "no checkpoint at nowhere"),
-    (["overwrite=true", "+trainer.accumulate_grad_batches=2"], "accumulate"),
-    (["overwrite=true", "+trainer.gradient_clip_algorithm=value"], "use norm"),
 ]
 
 
@@ -265,13 +249,13 @@ def test_posed_photographs_without_depth_are_trained_on(tmp_path: Path, cache: P
     assert "abs_rel" not in metrics
 
 
-@pytest.mark.parametrize(("name", "curves"), [("tensorboard", "tensorboard --logdir"), ("wandb", "wandb sync")])
-def test_other_loggers_get_curves_and_the_picture(name, curves, tmp_path, cache, monkeypatch, capsys):
+@pytest.mark.parametrize("name", ["tensorboard", "wandb"])
+def test_other_loggers_get_curves_and_the_picture(name, tmp_path, cache, monkeypatch, capsys):
     pytest.importorskip(name)
     monkeypatch.setenv("WANDB_MODE", "offline")
     monkeypatch.setenv("WANDB_SILENT", "true")
     train(small_config(tmp_path, cache, f"logger={name}", "trainer.max_steps=1"))
-    assert curves in capsys.readouterr().out
+    assert f"curves: {tmp_path}" in capsys.readouterr().out
     written = [path for pattern in ("*.tfevents.*", "run-*.wandb") for path in tmp_path.rglob(pattern)]
     content = b"".join(path.read_bytes() for path in written if not path.is_symlink())
     assert b"train/grad_norm" in content

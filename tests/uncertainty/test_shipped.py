@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from vg2gt.data import SyntheticScenes
-from vg2gt.evaluation.calibrate import decode
-from vg2gt.evaluation.stated import pixels_with_errors
+from vg2gt.evaluation.scene_metrics import pixels_with_errors
 from vg2gt.geometry.pose_noise import with_pose_noise
 from vg2gt.runs.load import LoadedModel, load_model, made_for
 from vg2gt.types import Batch, Cameras
@@ -34,8 +33,9 @@ def measured(model: LoadedModel, rooms: int, views: int, noisy: float = 0.25) ->
     parts = []
     for number in range(rooms):
         batch = room(number, views)
-        hints = with_pose_noise(batch, noisy)
-        parts.append(pixels_with_errors(*decode(model.model, batch, hints), batch, predicts_cameras=False))
+        with torch.no_grad():
+            made = model.model(batch.images, with_pose_noise(batch, noisy))
+        parts.append(pixels_with_errors(made, made.supported, batch, predicts_cameras=False))
     pixels = Samples.joined(parts)
     assert model.calibration is not None
     bounds = model.calibration.bounds(pixels.evidence, pixels.status)

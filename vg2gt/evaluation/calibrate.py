@@ -8,19 +8,16 @@ from pathlib import Path
 import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig
-from torch import Tensor
 
 from vg2gt.data.datamodule import SceneDataModule
 from vg2gt.data.views.drawn import ViewSelection
 from vg2gt.evaluation.checks import refuse_training_views, refuse_without_hints
 from vg2gt.evaluation.run import view_counts
-from vg2gt.evaluation.stated import pixels_with_errors
+from vg2gt.evaluation.scene_metrics import pixels_with_errors
 from vg2gt.geometry.pose_noise import with_pose_noise
 from vg2gt.geometry.precision import half_precision_on_gpu
-from vg2gt.model import VG2GT, Reconstructor
 from vg2gt.runs.checkpoints import checkpoint_path
 from vg2gt.runs.load import build_model, calibration_path, choose_device, load_weights, made_for, resolve_parts
-from vg2gt.types import Batch, Decoded, Hints
 from vg2gt.uncertainty import Samples, calibrate
 
 log = logging.getLogger(__name__)
@@ -58,34 +55,14 @@ def make_calibration(config: DictConfig) -> Path:
     found = []
     for number, sample in enumerate(chosen):
         batch = data[(sample,)].to(device)
-        decoded, keep = decode(model, batch, with_pose_noise(batch, config.pose_noise))
-        pixels = pixels_with_errors(decoded, keep, batch, model.backend.predicts_cameras, number)
-        found.append(_thinned(pixels, config.pixels, number))
+        with torch.no_grad(), half_precision_on_gpu(batch.images):
+            prediction = model(batch.images, with_pose_noise(batch, config.pose_noise))
+        pixels = pixels_with_errors(prediction, prediction.supported, batch, model.backend.predicts_cameras, number)
+        drawn = torch.randperm(len(pixels.error), generator=torch.Generator().manual_seed(number))
+        found.append(pixels.select(drawn[: config.pixels].sort().values))
         log.info("scene %d of %d: %s, %d views", number + 1, len(chosen), sample.scene, len(sample.context))
     path = Path(config.out) if config.out is not None else calibration_path(checkpoint)  # pyright: ignore
     made = calibrate(Samples.joined(found), made_for(model))
     made.write(path)
     print(f"{path}: from {made.scenes} scenes, {sum(len(each.error) for each in found)} pixels")
     return path
-
-
-@torch.no_grad()
-def decode(model: Reconstructor, batch: Batch, hints: Hints) -> tuple[Decoded, Tensor | None]:
-    """Decodes the geometry of a batch; VG2GT does so without building the Gaussians.
-
-    Returns:
-        The decoded geometry, and ``[B, V, H, W]`` bool, the pixels that the scene is made of; None: all with a depth.
-    """
-    with half_precision_on_gpu(batch.images):
-        if not isinstance(model, VG2GT):
-            prediction = model(batch.images, hints)
-            return prediction, prediction.supported
-        decoded = model.enhance(batch.images, hints)[1]
-        support = model.support(decoded.geometry, hints)
-    return decoded, None if support is None else support.keep
-
-
-def _thinned(pixels: Samples, most: int, seed: int) -> Samples:
-    """At most ``most`` pixels, drawn at random."""
-    drawn = torch.randperm(len(pixels.error), generator=torch.Generator().manual_seed(seed))
-    return pixels.select(drawn[:most].sort().values)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import logging
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from typing import Any
 
 import torch
 
@@ -16,10 +15,9 @@ from vg2gt.evaluation.scene_metrics import (
     align_geometry,
     image_metrics,
     point_cloud_metrics,
-    present,
     rendered_normal_metrics,
+    stated_metrics,
 )
-from vg2gt.evaluation.stated import stated_metrics
 from vg2gt.geometry.precision import half_precision_on_gpu
 from vg2gt.metrics import LPIPS, camera_metrics, cv, depth_metrics
 from vg2gt.model import Reconstructor
@@ -28,8 +26,6 @@ from vg2gt.refinement import Observations, RefineOptions, refine
 from vg2gt.rendering import Renderer
 from vg2gt.types import Batch, Cameras, Prediction, Render
 from vg2gt.uncertainty import Calibration
-
-log = logging.getLogger(__name__)
 
 MODES = ("solid", "rasterized")
 PROTOCOLS = ("novel", "gt_pose", "context")
@@ -91,29 +87,39 @@ class SceneEvaluator:
             refined, cost = self._refine(batch, prediction, self.refinement)
             scores, _ = self._score(batch, refined, cost, has_cameras)
             # refinement does not change the decoded depth
-            metrics |= {
-                f"refined/{name}": value for name, value in scores.items() if not name.startswith(("decoded", "stated"))
-            }
-        return SceneResult(present(metrics), prediction, renders)
+            kept = {name: value for name, value in scores.items() if not name.startswith(("decoded", "stated"))}
+            metrics |= _under("refined", kept)
+        finite = {name: value if math.isfinite(value) else None for name, value in metrics.items()}  # JSON has no NaN
+        return SceneResult(finite, prediction, renders)
 
     def _score(
         self, batch: Batch, prediction: Prediction, cost: dict[str, float], has_cameras: bool
     ) -> tuple[dict[str, float], dict[str, Render]]:
         """All metrics of one prediction, and its solid renders by protocol."""
-        known = self._known(batch)
+        inside = (batch.depth >= self.options.nearest) & (batch.depth <= self.options.farthest)
+        known = replace(batch, depth=torch.where(inside, batch.depth, 0.0))
         metrics: dict[str, float] = {}
         renders: dict[str, Render] = {}
+        device = batch.images.device
         for protocol, cameras in self._cameras(batch, prediction, has_cameras).items():
             truth = known.context if protocol == "context" else known.target
             for mode in MODES:
-                rendered, seconds = self._render(prediction, cameras, mode)
-                metrics |= _under(f"rendered/{protocol}/{mode}", self._view_metrics(rendered, truth, has_cameras))
+                began = now(device)
+                rendered = render_or_nan(self.renderer, prediction.gaussians, cameras, mode)
+                seconds = (now(device) - began) / cameras.world_to_camera.shape[1]
+                found = image_metrics(rendered, truth, self.lpips) | self._depth_metrics(rendered.depth, truth)
+                if has_cameras:
+                    found |= rendered_normal_metrics(rendered, truth)
+                metrics |= _under(f"rendered/{protocol}/{mode}", found)
                 if mode == "solid":
                     renders[protocol] = rendered
                     cost["render_seconds"] = seconds
         metrics |= _under("decoded/before", self._depth_metrics(prediction.initial.depth, known.context))
         metrics |= _under("decoded/after", self._depth_metrics(prediction.geometry.depth, known.context))
-        metrics |= self._stated_metrics(known.context, prediction)
+        if self.calibration is not None:
+            predicts = self.model.backend.predicts_cameras
+            stated = stated_metrics(self.calibration, prediction, prediction.supported, known.context, predicts)
+            metrics |= _under("stated", stated)
         if has_cameras:
             metrics |= self._pose_and_point_cloud_metrics(known.context, prediction, renders["context"])
         cost["cv"] = cv(prediction.gaussians.means, self.options.neighbors, CV_QUERIES)
@@ -130,9 +136,12 @@ class SceneEvaluator:
         mask = None if context.mask is None else context.mask[0]
         seen = Observations(context.images[0], geometry.depth[0], geometry.depth_conf[0], mask)
         found = refine(prediction.gaussians, geometry.cameras, seen, self.renderer, options)
-        cost = {"refine_seconds": now(device) - began, "peak_memory_mib": peak_memory_mib(device)}
         gaussians = found.scene.gaussians
-        cost["gaussians"] = float(len(gaussians))
+        cost = {
+            "refine_seconds": now(device) - began,
+            "peak_memory_mib": peak_memory_mib(device),
+            "gaussians": float(len(gaussians)),
+        }
         geometry = replace(geometry, cameras=found.scene.cameras)
         return replace(prediction, gaussians=gaussians, geometry=geometry), cost
 
@@ -158,30 +167,8 @@ class SceneEvaluator:
                 cameras["gt_pose"] = ground_truth_target_cameras(batch, prediction)
         return cameras
 
-    def _render(self, prediction: Prediction, cameras: Cameras, mode: Any) -> tuple[Render, float]:
-        """The rendered views, and seconds per view."""
-        device = prediction.gaussians.means.device
-        begin = now(device)
-        rendered = render_or_nan(self.renderer, prediction.gaussians, cameras, mode)
-        return rendered, (now(device) - begin) / cameras.world_to_camera.shape[1]
-
-    def _known(self, batch: Batch) -> Batch:
-        """The batch with true depths outside ``depth_range`` set to 0 (unknown)."""
-        inside = (batch.depth >= self.options.nearest) & (batch.depth <= self.options.farthest)
-        return replace(batch, depth=torch.where(inside, batch.depth, 0.0))
-
-    def _view_metrics(self, rendered: Render, truth: Batch, has_cameras: bool) -> dict[str, float]:
-        metrics = image_metrics(rendered, truth, self.lpips) | self._depth_metrics(rendered.depth, truth)
-        return metrics | rendered_normal_metrics(rendered, truth) if has_cameras else metrics
-
     def _depth_metrics(self, depth: torch.Tensor, truth: Batch) -> dict[str, float]:
         return depth_metrics(depth[0], truth.depth[0], self.options.alignment)
-
-    def _stated_metrics(self, truth: Batch, prediction: Prediction) -> dict[str, float]:
-        if self.calibration is None:
-            return {}
-        predicts = self.model.backend.predicts_cameras
-        return _under("stated", stated_metrics(self.calibration, prediction, prediction.supported, truth, predicts))
 
     def _pose_and_point_cloud_metrics(self, truth: Batch, prediction: Prediction, rendered: Render) -> dict[str, float]:
         metrics: dict[str, float] = {}

@@ -9,7 +9,6 @@ import torch
 
 from vg2gt.evaluation.protocols import ground_truth_target_cameras
 from vg2gt.evaluation.scene_metrics import (
-    depth_to_camera_scale,
     edge_metrics,
     image_metrics,
     rendered_normal_metrics,
@@ -69,8 +68,6 @@ def _scene_figures(prediction: Prediction, renderer: Renderer, batch: Batch, ras
         "decoded_abs_rel_before": abs_rel(prediction.initial.depth, batch.context),
         "decoded_abs_rel": abs_rel(prediction.geometry.depth, batch.context),
         **edge_metrics(rendered, target, "scene"),
-        "depth_to_camera_scale_before": depth_to_camera_scale(prediction.initial, batch.context),
-        "depth_to_camera_scale": depth_to_camera_scale(prediction.geometry, batch.context),
         "gaussians": float(len(prediction.gaussians)),
         "cv": cv(prediction.gaussians.means, max_queries=CV_QUERIES),
     }

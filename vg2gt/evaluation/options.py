@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 
 from vg2gt.data.views.drawn import ViewSelection
 from vg2gt.metrics.depth import ALIGNMENTS
@@ -11,7 +11,7 @@ from vg2gt.metrics.depth import ALIGNMENTS
 
 @dataclass(frozen=True)
 class PointOptions:
-    """Options of the point-cloud comparison; lengths are positive, in the data's unit.
+    """Options of the point-cloud comparison; lengths are in the data's unit.
 
     Args:
         threshold: distance below which a point counts as correct.
@@ -22,12 +22,6 @@ class PointOptions:
     threshold: float = 0.05
     downsample: float | None = 0.02
     cap: float | None = None
-
-    def __post_init__(self) -> None:
-        for name, length in asdict(self).items():
-            optional = length is None and name != "threshold"
-            if not optional and (length is None or not length > 0):
-                raise ValueError(f"evaluation.points.{name}={length}: give a positive length in the data's unit")
 
 
 @dataclass(frozen=True)
@@ -47,7 +41,7 @@ class EvaluationOptions:
         table: data set in the paper's tables whose rows are printed below ours; None: no rows of the paper.
 
     Raises:
-        ValueError: if the alignment is unknown or a number is out of range.
+        ValueError: if the alignment is unknown or the depth range is empty.
     """
 
     selection: ViewSelection = field(default_factory=ViewSelection)
@@ -63,11 +57,6 @@ class EvaluationOptions:
     def __post_init__(self) -> None:
         if self.alignment not in ALIGNMENTS:
             raise ValueError(f"evaluation.alignment={self.alignment!r}: choose one of {', '.join(ALIGNMENTS)}")
-        if self.neighbors < 1 or self.pictures < 0 or self.refine < 0 or len(self.depth_range) != 2:
-            raise ValueError(
-                "evaluation needs neighbors >= 1, pictures >= 0, refine >= 0 and depth_range=[nearest,farthest], got "
-                f"{self.neighbors}, {self.pictures}, {self.refine} and {list(self.depth_range)}"
-            )
         if not 0 <= self.nearest < self.farthest:
             raise ValueError(
                 f"evaluation.depth_range={list(self.depth_range)} leaves no depth: give [nearest,farthest] with "

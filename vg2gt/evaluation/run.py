@@ -70,7 +70,10 @@ def _evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
     parts = resolve_parts(config, checkpoint)
     datamodule: SceneDataModule = instantiate(config.data)
     data = datamodule.evaluation_data()
-    samples = _samples(options, data.source, list(data.source.scenes)[: datamodule.eval_scenes], counts)
+    scenes = list(data.source.scenes)[: datamodule.eval_scenes]
+    if not scenes:
+        raise DataError(f"there is no scene to evaluate: data.eval_scenes takes none of {len(data.source.scenes)}")
+    samples = {count: options.selection.choose(data.source, scenes, count) for count in counts}
     refuse_training_views(checkpoint, data.source, [view for views in samples.values() for view in views])
 
     device = choose_device(config.device)
@@ -129,17 +132,6 @@ def view_counts(views: Any) -> list[int]:
     return sorted(set(counts))
 
 
-def _samples(
-    options: EvaluationOptions, source: SceneSource, scenes: Sequence[str], counts: Sequence[int]
-) -> dict[int, list[SceneSample]]:
-    if not scenes:
-        raise DataError(
-            f"there is no scene to evaluate: {type(source).__name__} offers {len(source.scenes)}, data.eval_scenes "
-            "takes none of them; data.eval_scenes=null takes all"
-        )
-    return {count: options.selection.choose(source, scenes, count) for count in counts}
-
-
 def _lpips(source: str | None, device: torch.device) -> tuple[LPIPS | None, str]:
     """The network and its description in the report; raises only if weights given by path are missing."""
     if source is None:
@@ -183,8 +175,7 @@ def _evaluate_all(
             if wanted:
                 protocol = next(name for name in ("gt_pose", "novel", "context") if name in result.renders)
                 truth = batch.context if protocol == "context" else batch.target
-                shown = scene_picture(batch, result.renders[protocol], truth, evaluator.options.alignment)
-                write_png(store.picture(views), shown)
+                write_png(store.picture(views), scene_picture(batch, result.renders[protocol], truth))
             metrics = result.metrics
             store.write(views, metrics)
             log.info("%d views, scene %d of %d: %s", len(views.context), number + 1, len(samples), views.scene)

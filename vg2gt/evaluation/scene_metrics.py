@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
-from vg2gt.geometry.alignment import Similarity, align_cameras, align_points, fit_depth_scale
+from vg2gt.geometry.alignment import Similarity, align_points
 from vg2gt.geometry.cameras import unproject
 from vg2gt.geometry.normals import normals_from_depth
-from vg2gt.metrics import LPIPS, depth_metrics, near_depth_edges, normal_metrics, point_metrics, psnr, ssim
-from vg2gt.types import Batch, Cameras, Geometry, Render
+from vg2gt.metrics import (
+    LPIPS,
+    depth_metrics,
+    near_depth_edges,
+    normal_metrics,
+    point_metrics,
+    psnr,
+    ssim,
+    stated_error_metrics,
+)
+from vg2gt.types import Batch, Cameras, Decoded, Geometry, Render
+from vg2gt.uncertainty import LEVELS, Calibration, Samples, pixel_evidence
 
 
 def image_metrics(rendered: Render, truth: Batch, lpips: LPIPS | None = None) -> dict[str, float]:
@@ -48,13 +56,6 @@ def edge_metrics(rendered: Render, truth: Batch, alignment: str) -> dict[str, fl
     return {"edge_psnr": float(psnr), "edge_abs_rel": depth["abs_rel"]}
 
 
-def depth_to_camera_scale(geometry: Geometry, truth: Batch) -> float:
-    """Ratio of the scale of decoded depth to that of camera translations; 1 if consistent, NaN if unknown."""
-    depth = fit_depth_scale(geometry.depth, truth.depth, truth.depth > 0)
-    unknown = torch.full_like(depth, torch.nan)
-    return float(align_cameras(geometry.cameras, truth.cameras, lambda: unknown).scale / depth)
-
-
 def point_cloud_metrics(
     depth: Tensor, cameras: Cameras, truth: Batch, similarity: Similarity, **options: float | None
 ) -> dict[str, float]:
@@ -86,6 +87,39 @@ def align_geometry(geometry: Geometry, truth: Batch) -> Similarity | None:
     return align_points(predicted[valid][None], reference[valid][None])
 
 
-def present(values: dict[str, float]) -> dict[str, float | None]:
-    """Replaces NaN and infinity, which JSON lacks, by None."""
-    return {name: value if math.isfinite(value) else None for name, value in values.items()}
+def stated_metrics(
+    calibration: Calibration, decoded: Decoded, keep: Tensor | None, truth: Batch, predicts_cameras: bool
+) -> dict[str, float]:
+    """Scores the error bounds of one scene's decoded depth (:func:`vg2gt.metrics.stated_error_metrics`).
+
+    Args:
+        calibration: calibration of the model.
+        decoded: decoded geometry of one scene (B = 1).
+        keep: ``[1, V, H, W]`` bool, pixels that the scene is made of; None: all with a depth.
+        truth: context views of the scene.
+        predicts_cameras: see :func:`pixels_with_errors`.
+    """
+    pixels = pixels_with_errors(decoded, keep, truth, predicts_cameras)
+    return stated_error_metrics(pixels.error, calibration.bounds(pixels.evidence, pixels.status), LEVELS)
+
+
+def pixels_with_errors(
+    decoded: Decoded, keep: Tensor | None, truth: Batch, predicts_cameras: bool, scene: int = 0
+) -> Samples:
+    """Collects the pixels of one scene that have decoded and true depth, with their evidence and true error.
+
+    Args:
+        decoded: decoded geometry of one scene (B = 1).
+        keep: ``[1, V, H, W]`` bool, pixels that the scene is made of; None: all with a depth.
+        truth: context views of the scene.
+        predicts_cameras: whether the backbone predicts the cameras and thus the unit. If so, the median ratio to the
+            true depth is divided out first; given cameras fix the unit.
+        scene: scene number stored in the samples.
+    """
+    depth, true = decoded.geometry.depth[0].float(), truth.depth[0].float()
+    evidence, status = pixel_evidence(decoded.geometry, keep)
+    rows = (depth > 0) & (true > 0) & true.isfinite()
+    ratio = true[rows] / depth[rows]
+    ratio = ratio / ratio.median() if predicts_cameras and len(ratio) else ratio * decoded.unit[0]
+    error = (ratio - 1).abs()
+    return Samples(evidence[rows], status[rows], error, torch.full_like(error, scene, dtype=torch.int64)).to("cpu")

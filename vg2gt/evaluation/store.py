@@ -25,8 +25,8 @@ class ResultStore:
         overwrite: remove the results that the folder holds, of this or another evaluation.
 
     Raises:
-        FileExistsError: if the folder holds an evaluation with other settings, naming the first that differ, or files
-            that do not belong to an evaluation, which are never replaced.
+        FileExistsError: if the folder holds an evaluation with other settings, or files that do not belong to an
+            evaluation, which are never replaced.
     """
 
     def __init__(self, folder: Path, identity: Mapping[str, Any], overwrite: bool = False) -> None:
@@ -48,11 +48,10 @@ class ResultStore:
             before = read_json(folder / IDENTITY)
             different = sorted(key for key in before.keys() | identity.keys() if before.get(key) != identity.get(key))
             if different:
-                told = ", ".join(f"{key} ({before.get(key)} -> {identity.get(key)})" for key in different[:3])
-                more = f" and {len(different) - 3} more" if len(different) > 3 else ""
+                told = ", ".join(f"{key} ({before.get(key)} -> {identity.get(key)})" for key in different)
                 raise FileExistsError(
-                    f"{folder} holds an evaluation with other settings: {told}{more}; choose another name=, or replace "
-                    "it with overwrite=true"
+                    f"{folder} holds an evaluation with other settings: {told}; choose another name=, or replace it "
+                    "with overwrite=true"
                 )
         write_json(folder / IDENTITY, dict(identity))
 
@@ -61,22 +60,14 @@ class ResultStore:
         path = self._path(views)
         if not path.is_file():
             return None
-        try:
-            stored = read_json(path)
-        except ValueError:
-            return None  # damaged: the sample is evaluated again
+        stored = read_json(path)
         same = stored["context"] == list(views.context) and stored["target"] == list(views.target)
         return stored["scores"] if same else None
 
     def write(self, views: SceneSample, metrics: Mapping[str, float | None]) -> None:
         """Writes the metrics of a sample, atomically."""
-        content = {
-            "scene": views.scene,
-            "context": list(views.context),
-            "target": list(views.target),
-            "scores": dict(metrics),
-        }
-        write_json(self._path(views), content)
+        frames = {"context": list(views.context), "target": list(views.target)}
+        write_json(self._path(views), {"scene": views.scene, **frames, "scores": dict(metrics)})
 
     def picture(self, views: SceneSample) -> Path:
         """Path of a sample's picture."""

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import zipfile
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +14,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from vg2gt.io.files import flush_folder, flush_to_disk, write_bytes
+from vg2gt.io.files import replacing, write_bytes
 
 log = logging.getLogger(__name__)
 
@@ -27,25 +25,17 @@ MODEL_PREFIX = "model."  # prefix of the model's names in a checkpoint's state_d
 
 
 def write_checkpoint(checkpoint: Mapping[str, Any], path: str | Path) -> None:
-    """Writes to ``<path>.tmp``, flushes to disk and renames, so that ``path`` is never half-written.
+    """Writes under a temporary name, flushes to disk and renames, so that ``path`` is never half-written.
 
     Raises:
         OSError: if it cannot be written (such as a full disk); an existing ``path`` is left intact.
     """
-    target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = target.with_name(target.name + ".tmp")
     try:
-        with open(temporary, "wb") as file:
+        with replacing(path, durable=True) as temporary, open(temporary, "wb") as file:
             torch.save(checkpoint, file)
-            flush_to_disk(file)
-        os.replace(temporary, target)
-        flush_folder(target.parent)
     except (OSError, RuntimeError) as error:  # torch's writer may raise RuntimeError for a full disk
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
         raise OSError(
-            f"checkpoint {target} could not be written ({error}; is the disk full?); earlier checkpoints are intact: "
+            f"checkpoint {path} could not be written ({error}; is the disk full?); earlier checkpoints are intact: "
             "free disk space and resume with ckpt=last"
         ) from error
 
@@ -63,7 +53,9 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     if path.suffix == SLIM:
         return _read_slim(path)
     try:
-        _verify_checksums(path)
+        with zipfile.ZipFile(path) as archive:  # torch.load does not verify checksums: flipped bits become weights
+            if (wrong := archive.testzip()) is not None:
+                raise ValueError(f"wrong checksum of {wrong}")
         content = torch.load(path, map_location="cpu", weights_only=True)
         if not isinstance(content, dict):
             raise ValueError(f"it holds a {type(content).__name__}")
@@ -126,14 +118,6 @@ def refuse_not_finite(state: Mapping[str, Tensor], path: str | Path) -> None:
         raise ValueError(f"checkpoint {path} has non-finite weights ({bad}): use an earlier checkpoint of its run")
 
 
-def _verify_checksums(path: Path) -> None:
-    """Verifies the checksums, which torch.load does not do: flipped bits would become weights."""
-    with zipfile.ZipFile(path) as archive:
-        wrong = archive.testzip()
-    if wrong is not None:
-        raise ValueError(f"wrong checksum of {wrong}")
-
-
 def newest_valid(folder: str | Path) -> Path:
     """Returns the newest readable checkpoint in a folder, logging damaged ones.
 
@@ -187,30 +171,27 @@ def initialize_from(module: nn.Module, path: str | Path) -> None:
         log.warning("layers of the checkpoint this model does not have: %s", ", ".join(unused))
 
 
-def checkpoint_path(ckpt: str | Path | None) -> Path | None:
+def checkpoint_path(ckpt: str | Path | None, option: str = "ckpt") -> Path | None:
     """Returns ``ckpt`` if it is a file, or the newest valid checkpoint of a run's folder; None for None.
 
     Raises:
-        FileNotFoundError: if there is no such file or folder, or the folder has no valid checkpoint.
+        FileNotFoundError: if there is no such file or folder, or the folder has no valid checkpoint; names ``option``.
     """
     if ckpt is None:
         return None
     path = Path(ckpt)
+    if path.is_file():
+        return path
+    folder, found = path / "checkpoints" if (path / "checkpoints").is_dir() else path, "no such checkpoint or run"
     if path.is_dir():
-        folder = path / "checkpoints" if (path / "checkpoints").is_dir() else path
         try:
             return newest_valid(folder)
-        except FileNotFoundError as error:
-            raise FileNotFoundError(
-                f"ckpt={ckpt}: no valid checkpoint in {folder}; give a run's folder such as outputs/quickstart, a "
-                "checkpoint's file, or ckpt=null for the untrained head"
-            ) from error
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"ckpt={ckpt}: no such checkpoint or run; give a file, a run's folder such as outputs/quickstart, or "
-            "ckpt=null for the untrained head"
-        )
-    return path
+        except FileNotFoundError:
+            found = f"no valid checkpoint in {folder}"
+    raise FileNotFoundError(
+        f"{option}={ckpt}: {found}; give a run's folder such as outputs/quickstart, a checkpoint's file, or null for "
+        "none (the untrained head)"
+    )
 
 
 def run_config_path(checkpoint: Path) -> Path:

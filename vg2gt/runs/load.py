@@ -231,24 +231,19 @@ def _config_of(checkpoint: Path, parts: Sequence[str]) -> DictConfig:
             raise ValueError(f"{source} has no {part}, so it is not a run's configuration; set {part}=")
         check_targets(run[part], f"{source}: {part}")
     if known is not None:
-        _refuse_differences(run, known, parts, path, checkpoint)
+        plain = (OmegaConf.to_container(config) for config in (run, known))
+        here, there = (flatten({part: each.get(part) for part in parts}) for each in plain)  # pyright: ignore
+        different = [
+            f"{key} is {here.get(key)} in the file, {there.get(key)} in the checkpoint"
+            for key in sorted(here.keys() | there.keys())
+            if here.get(key) != there.get(key) and key.rpartition(".")[2] not in FREE
+        ]
+        if different:
+            raise ValueError(
+                f"{path} does not match {checkpoint}: {'; '.join(different)}. Correct it, or delete it: the checkpoint "
+                "stores its own configuration"
+            )
     return run
-
-
-def _refuse_differences(run: DictConfig, known: DictConfig, parts: Sequence[str], path: Path, checkpoint: Path) -> None:
-    """Raises ValueError if a run's file describes a different model than its checkpoint does."""
-    plain = (OmegaConf.to_container(config) for config in (run, known))
-    here, there = (flatten({part: config.get(part) for part in parts}) for config in plain)  # pyright: ignore
-    different = [
-        f"{key} is {here.get(key)} in the file, {there.get(key)} in the checkpoint"
-        for key in sorted(here.keys() | there.keys())
-        if here.get(key) != there.get(key) and key.rpartition(".")[2] not in FREE
-    ]
-    if different:
-        raise ValueError(
-            f"{path} does not match {checkpoint}: {'; '.join(different[:5])}. Correct it, or delete it: the "
-            "checkpoint stores its own configuration"
-        )
 
 
 def build_model(parts: dict[str, DictConfig], seed: int, device: torch.device) -> Reconstructor:
@@ -294,16 +289,14 @@ def find_calibration(
         FileNotFoundError: if ``path`` does not exist.
         ValueError: if a file is damaged, or ``path`` was made for other weights.
     """
-    named = path is not None
-    if path is None:
-        path = None if weights.path is None else calibration_path(weights.path)
-        if path is None or not path.is_file():
-            return None
-    found = read_calibration(path)
+    beside = calibration_path(weights.path) if weights.path is not None else None
+    if path is None and (beside is None or not beside.is_file()):
+        return None
+    found = read_calibration(path or beside)
     if found.made_for == made_for(model):
         return found
-    message = f"{path} was made for other weights: recreate it with vg2gt calibrate"
-    if named:
+    message = f"{path or beside} was made for other weights: recreate it with vg2gt calibrate"
+    if path is not None:
         raise ValueError(message)
     log.warning("%s; depth error bounds are not available", message)
     return None
@@ -311,13 +304,11 @@ def find_calibration(
 
 def choose_device(asked: str) -> torch.device:
     """Returns the named device, for ``auto`` the GPU if there is one; raises ValueError if it is not available."""
-    there = torch.cuda.is_available()
     try:
-        device = torch.device(("cuda" if there else "cpu") if asked == "auto" else asked)
+        device = torch.device(("cuda" if torch.cuda.is_available() else "cpu") if asked == "auto" else asked)
         torch.empty(0, device=device)
     except (RuntimeError, AssertionError, NotImplementedError) as error:
-        known = "the GPU (cuda) and the CPU" if there else "the CPU"
         raise ValueError(
-            f"device={asked} is not available to torch, only {known}; device=auto uses the GPU if there is one"
+            f"device={asked} is not available to torch here; device=auto uses the GPU if there is one"
         ) from error
     return device

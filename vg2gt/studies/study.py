@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import gc
-import hashlib
 import logging
 import math
+import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
 from omegaconf import DictConfig, OmegaConf
 from scipy.stats import t as student
-from torch import Tensor
 
 from vg2gt.config import compose, flatten
 from vg2gt.evaluation.tables import Metric, markdown_table, number
 from vg2gt.io.files import read_json, write_json, write_text
+from vg2gt.io.tensors import tensors_digest
 from vg2gt.runs.checkpoints import newest_valid, read_checkpoint, write_checkpoint
 from vg2gt.runs.trust import read_run_config
 from vg2gt.training.loop import build, evaluate, train
@@ -55,7 +54,6 @@ def run_once(overrides: Sequence[str], folder: Path, scored: bool = True) -> Met
     config = compose_run(overrides, folder)
     config.training.rasterized_depth = True  # studies report it
     _refuse_other_run(config, folder)
-    _refuse_other_start(config, folder)
     result = folder / "metrics.json"
     if result.is_file():
         return read_json(result)["trained"]
@@ -84,45 +82,28 @@ def _without_steps(config: DictConfig, folder: Path, scored: bool) -> dict[str, 
 
 
 def _refuse_other_run(config: DictConfig, folder: Path) -> None:
-    path = folder / "config.yaml"
-    if not path.is_file():
-        return
-    before, now = (flatten(OmegaConf.to_container(c, resolve=True)) for c in (read_run_config(path), config))
-    keys = {
-        key
-        for key in before.keys() | now.keys()
-        if (key.split(".")[0] in COMPARED or key in COMPARED_KEYS) and key not in NOT_COMPARED
-    }
-    different = sorted(key for key in keys if before.get(key) != now.get(key))
-    if different:
+    """Raises ValueError if the folder's run has other settings or initial weights; a new run's weights are noted."""
+    path, start = folder / "config.yaml", folder / START
+    other: list[str] = []
+    if path.is_file():
+        before, now = (flatten(OmegaConf.to_container(c, resolve=True)) for c in (read_run_config(path), config))
+        other = [
+            key
+            for key in sorted(before.keys() | now.keys())
+            if (key.split(".")[0] in COMPARED or key in COMPARED_KEYS) and key not in NOT_COMPARED
+            if before.get(key) != now.get(key)
+        ]
+    if config.get("init_from"):
+        weights = {"weights": tensors_digest(read_checkpoint(config.init_from)["state_dict"])}
+        if start.is_file():
+            other += [] if read_json(start) == weights else ["the weights in init_from"]
+        elif not path.is_file():
+            write_json(start, weights)
+    if other:
         raise ValueError(
-            f"{folder} holds a run with other settings ({', '.join(different)}): choose another name=, repeat the "
+            f"{folder} holds a run with other settings ({', '.join(other)}): choose another name=, repeat the "
             "settings, or delete the folder"
         )
-
-
-def _refuse_other_start(config: DictConfig, folder: Path) -> None:
-    """Records the digest of a new run's initial weights; ValueError if the folder's run started from others."""
-    if not config.init_from:
-        return
-    path, weights = folder / START, weights_digest(read_checkpoint(config.init_from)["state_dict"])
-    if path.is_file():
-        if read_json(path)["weights"] != weights:
-            raise ValueError(
-                f"{folder} holds a run that started from other weights than those of {config.init_from}: choose "
-                "another name=, or delete the folder"
-            )
-    elif not (folder / "config.yaml").is_file():
-        write_json(path, {"weights": weights})
-
-
-def weights_digest(state: Mapping[str, Tensor]) -> str:
-    """SHA-256 of tensors and their names."""
-    digest = hashlib.sha256()
-    for name, tensor in sorted(state.items()):
-        digest.update(f"{name} {tuple(tensor.shape)} {tensor.dtype}".encode())
-        digest.update(tensor.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes())
-    return digest.hexdigest()
 
 
 def final_checkpoint(folder: Path, steps: int) -> Path:
@@ -159,12 +140,10 @@ class Estimate:
 
 def estimate(values: Sequence[float]) -> Estimate:
     """Mean and 95 % confidence interval of independent values; NaN without values."""
-    count = len(values)
-    mean = sum(values) / count if count else math.nan
-    if count < 2:
-        return Estimate(mean, math.nan)
-    deviation = math.sqrt(sum((value - mean) ** 2 for value in values) / (count - 1))
-    return Estimate(mean, float(student.ppf(0.975, count - 1)) * deviation / math.sqrt(count))
+    if len(values) < 2:
+        return Estimate(values[0] if values else math.nan, math.nan)
+    margin = student.ppf(0.975, len(values) - 1) * statistics.stdev(values) / math.sqrt(len(values))
+    return Estimate(statistics.fmean(values), float(margin))
 
 
 def over_seeds(runs: Mapping[int, Metrics], metric: str) -> Estimate:

@@ -1,9 +1,13 @@
-"""Lightning checkpoints: atomic writes, and a callback that keeps the newest ones."""
+"""Checkpoints of a run: atomic writes, the newest ones kept, and one more on a signal."""
 
 from __future__ import annotations
 
+import logging
+import os
+import signal
 from pathlib import Path
-from typing import Any, Literal
+from types import FrameType
+from typing import Any
 
 import lightning
 from lightning.pytorch.callbacks import ModelCheckpoint
@@ -12,7 +16,9 @@ from lightning.pytorch.trainer.states import TrainerFn
 
 from vg2gt.runs.checkpoints import by_age, read_checkpoint, write_checkpoint
 
-BEST = "best.ckpt"
+log = logging.getLogger(__name__)
+
+SIGNALS = (signal.SIGTERM, signal.SIGINT, *((signal.SIGUSR1,) if hasattr(signal, "SIGUSR1") else ()))
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
@@ -34,30 +40,11 @@ class NewestCheckpoints(ModelCheckpoint):
 
     Args:
         dirpath: folder of the checkpoints.
-        every_n_train_steps: number of training steps between checkpoints; at least 1.
+        every_n_train_steps: number of training steps between checkpoints.
         save_top_k: number of checkpoints to keep; -1 keeps all.
-        monitor: evaluation metric, such as ``eval/psnr``, whose best state is saved as ``best.ckpt``; None saves none.
-        mode: whether ``max`` or ``min`` of the metric is best.
-
-    Raises:
-        ValueError: if ``mode`` is unknown or a number is out of range.
     """
 
-    def __init__(
-        self,
-        dirpath: str,
-        every_n_train_steps: int = 100,
-        save_top_k: int = 3,
-        monitor: str | None = None,
-        mode: Literal["max", "min"] = "max",
-    ) -> None:
-        if mode not in ("max", "min"):
-            raise ValueError(f"callbacks.checkpoint.mode is {mode!r}; choose max or min")
-        if every_n_train_steps < 1 or (save_top_k < 1 and save_top_k != -1):
-            raise ValueError(
-                f"every_n_train_steps={every_n_train_steps} must be at least 1, save_top_k={save_top_k} at least 1, or "
-                "-1 for all"
-            )
+    def __init__(self, dirpath: str, every_n_train_steps: int = 100, save_top_k: int = 3) -> None:
         super().__init__(
             dirpath,
             "step-{step}",
@@ -67,8 +54,6 @@ class NewestCheckpoints(ModelCheckpoint):
             enable_version_counter=False,
         )
         self.kept = save_top_k
-        self.watched, self.sign = monitor, 1 if mode == "max" else -1
-        self.best: float | None = None
 
     def on_train_batch_end(self, trainer: lightning.Trainer, *args: Any, **more: Any) -> None:
         """Saves a checkpoint if one is due, then deletes all but the newest."""
@@ -77,24 +62,48 @@ class NewestCheckpoints(ModelCheckpoint):
             for path in by_age(Path(str(self.dirpath)))[self.kept :]:
                 path.unlink(missing_ok=True)
 
-    def on_validation_end(self, trainer: lightning.Trainer, *args: Any) -> None:
-        """Saves the best state by the monitored metric; raises ValueError if no such metric was logged."""
-        super().on_validation_end(trainer, *args)
-        if self.watched is None or trainer.state.fn != TrainerFn.FITTING or getattr(trainer, "fast_dev_run", False):
+
+class StopOnSignal(lightning.Callback):
+    """On SIGTERM, Ctrl-C or SIGUSR1 (SLURM's notice), finishes the step, saves a checkpoint and ends normally.
+
+    A second Ctrl-C ends at once. Outside training, signals end the process as usual.
+    """
+
+    def __init__(self) -> None:
+        self.received = False
+        self._previous: dict[signal.Signals, Any] = {}
+
+    def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Installs the signal handlers for the duration of training."""
+        self._previous = {number: signal.signal(number, self._note) for number in SIGNALS}
+
+    def on_validation_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Restores the default SIGTERM outside training, where Lightning's handler would only record the signal."""
+        if trainer.state.fn == TrainerFn.VALIDATING:
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        self.received = True
+        if number == signal.SIGINT:
+            signal.signal(number, signal.default_int_handler)
+            os.write(2, b"\nstopping after this step and saving a checkpoint; press Ctrl-C again to stop at once\n")
+
+    def on_train_batch_end(self, trainer: lightning.Trainer, *args: Any) -> None:
+        """Saves and stops at the end of the step in which a signal reached any rank."""
+        # Before training starts, Lightning's own handler records a SIGTERM.
+        asked = self.received or bool(getattr(trainer, "received_sigterm", False))
+        if not trainer.strategy.reduce_boolean_decision(asked, all=False):
             return
-        if self.watched not in trainer.callback_metrics:
-            known = ", ".join(sorted(name for name in trainer.callback_metrics if name.startswith("eval/")))
-            raise ValueError(f"callbacks.checkpoint.monitor={self.watched} is not measured; choose one of {known}")
-        value = float(trainer.callback_metrics[self.watched])
-        if value == value and (self.best is None or self.sign * (value - self.best) > 0):
-            self.best = value
-            trainer.save_checkpoint(Path(str(self.dirpath)) / BEST)
+        path = Path(trainer.default_root_dir) / "checkpoints" / f"step-{trainer.global_step}.ckpt"
+        if not getattr(trainer, "fast_dev_run", False):
+            trainer.save_checkpoint(path)
+        trainer.limit_val_batches = 0  # should_stop alone would evaluate once more
+        trainer.should_stop = True
+        log.warning("stopping after a signal: saved %s; resume with ckpt=last", path)
 
-    def state_dict(self) -> dict[str, Any]:
-        """Returns Lightning's state and the best value."""
-        return {**super().state_dict(), "best": self.best}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restores the state; old checkpoints have no best value."""
-        self.best = state_dict.pop("best", None)
-        super().load_state_dict(state_dict)
+    def teardown(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, stage: str) -> None:
+        """Restores the handlers that Lightning has not restored; also runs after an error."""
+        for number, handler in self._previous.items():
+            if signal.getsignal(number) == self._note:
+                signal.signal(number, handler)
+        self._previous = {}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import logging
 import math
 import os
@@ -25,6 +24,7 @@ from omegaconf import DictConfig
 from backends.cache import TokenCache
 from vg2gt.data.datamodule import SceneDataModule
 from vg2gt.evaluation.checks import refuse_without_hints
+from vg2gt.evaluation.pictures import PANELS
 from vg2gt.geometry.precision import trainer_precision
 from vg2gt.io.files import read_json, write_json, write_text
 from vg2gt.io.image_files import read_color
@@ -35,7 +35,7 @@ from vg2gt.runs.lock import only_process_in
 from vg2gt.training.checkpointing import AtomicCheckpointIO
 from vg2gt.training.distributed import ending_together
 from vg2gt.training.module import VG2GTModule
-from vg2gt.training.report import comparison_table, print_comparison, write_preview
+from vg2gt.training.report import comparison_table, write_preview
 from vg2gt.training.start import checkpoint_to_resume, load_start, prepare_folder
 
 log = logging.getLogger(__name__)
@@ -53,13 +53,6 @@ FEW_WORKERS = r"The '\w+_dataloader' does not have many workers"  # expected on 
 # Tensor sizes vary from step to step, which would fragment GPU memory. Read when CUDA initialises.
 ALLOCATOR = (f"PYTORCH_{'' if torch.__version__ >= '2.9' else 'CUDA_'}ALLOC_CONF", "expandable_segments:True")
 
-LOGGER_PACKAGES = {"TensorBoardLogger": "tensorboard", "WandbLogger": "wandb"}
-LOSS_WITHOUT = {
-    "geometry": "loss.geometry.depth=0 loss.geometry.point=0",
-    "enhance": "loss.enhance.weight=0",
-    "gaussian": "loss.gaussian.weight=0",
-    "align": "loss.align.source=enhanced, rendered or initial",
-}  # what to write instead of loss.SECTION=null
 PRECISIONS = ("auto", "32-true", "bf16-mixed", "32", "bf16")  # the last two are Lightning's short names
 
 
@@ -72,21 +65,22 @@ class Run:
         datamodule: training and evaluation scenes.
         trainer: Lightning's trainer.
         folder: output folder of the run, ``outputs/<name>``.
-        trial: whether this is a ``fast_dev_run``, which writes no reports and no checkpoints.
     """
 
     module: VG2GTModule
     datamodule: LightningDataModule
     trainer: Trainer
     folder: Path
-    trial: bool
+
+    @property
+    def trial(self) -> bool:
+        """Whether this is a ``fast_dev_run``, which writes no reports and no checkpoints."""
+        return bool(getattr(self.trainer, "fast_dev_run", False))
 
 
 def build(config: DictConfig) -> Run:
     """Instantiates the module, data and trainer of a configuration; each constructor is the schema of its section."""
-    _check_trainer(config)
-    _check_loggers(config)
-    _check_loss(config)
+    _check(config)
     lightning.seed_everything(config.seed, workers=True, verbose=False)
     accelerator = _accelerator(config.trainer.accelerator)
     if accelerator == "gpu":
@@ -117,7 +111,7 @@ def build(config: DictConfig) -> Run:
         plugins=[AtomicCheckpointIO()],
         default_root_dir=config.output_dir,
     )
-    return Run(module, datamodule, trainer, Path(config.output_dir), bool(config.trainer.get("fast_dev_run")))
+    return Run(module, datamodule, trainer, Path(config.output_dir))
 
 
 def _quieten_lightning() -> None:
@@ -153,43 +147,29 @@ def _accelerator(asked: str) -> str:
     return asked if asked != "auto" else "gpu" if torch.cuda.is_available() else "cpu"
 
 
-def _check_trainer(config: DictConfig) -> None:
-    if str(config.trainer.precision) not in PRECISIONS:
+def _check(config: DictConfig) -> None:
+    """Raises ValueError for options of the trainer and the loss that would silently mean something else."""
+    trainer = config.trainer
+    if str(trainer.precision) not in PRECISIONS:
         raise ValueError(
-            f"trainer.precision={config.trainer.precision} is not supported: geometry, voxels, rendering and losses "
-            "require float32 (half precision is too coarse, float64 brings no gain); use bf16-mixed (networks in "
-            "bfloat16), 32-true, or auto (bf16-mixed on a GPU, 32-true on a CPU)"
+            f"trainer.precision={trainer.precision} is not supported: geometry, voxels, rendering and losses require "
+            "float32 (half precision is too coarse, float64 brings no gain); use bf16-mixed (networks in bfloat16), "
+            "32-true, or auto (bf16-mixed on a GPU, 32-true on a CPU)"
         )
-    if config.trainer.get("accumulate_grad_batches", 1) != 1:
+    if trainer.get("accumulate_grad_batches", 1) != 1:
         raise ValueError(
             "trainer.accumulate_grad_batches is not supported: each batch is determined by the optimiser step; for "
             "larger steps, raise data.max_images"
         )
-    if (clipping := config.trainer.get("gradient_clip_algorithm")) not in (None, "norm"):
-        raise ValueError(f"trainer.gradient_clip_algorithm={clipping} is not supported; use norm")
-    if (norm := config.trainer.get("gradient_clip_val")) is not None and not norm >= 0:
-        raise ValueError(f"trainer.gradient_clip_val={norm} must be at least 0; null for no clipping")
-    every = config.trainer.get("val_check_interval")
-    if isinstance(every, (int, float)) and not every > 0:
+    if trainer.get("gradient_clip_algorithm") not in (None, "norm"):
         raise ValueError(
-            f"trainer.val_check_interval={every} must be a positive number of steps; a large one, such as 1000000000, "
-            "for no evaluation during training"
+            f"trainer.gradient_clip_algorithm={trainer.gradient_clip_algorithm} is not supported; use norm"
         )
-    steps, epochs = config.trainer.get("max_steps", -1), config.trainer.get("max_epochs")
-    if steps in (None, -1) and epochs in (None, -1) and not config.trainer.get("fast_dev_run"):
-        raise ValueError(
-            f"trainer.max_steps={steps} without trainer.max_epochs would never end, and the learning rate needs the "
-            "number of steps: set one of them"
-        )
-
-
-def _check_loss(config: DictConfig) -> None:
-    """Raises ValueError for a null section of the loss, which would mean the defaults of its class."""
-    if not str(config.loss.get("_target_")).endswith(".VG2GTLoss"):
-        return
-    for section, remedy in LOSS_WITHOUT.items():
-        if section in config.loss and config.loss[section] is None:
-            raise ValueError(f"loss.{section}=null does not turn anything off: use {remedy}")
+    if trainer.get("val_check_interval") == 0:
+        raise ValueError("trainer.val_check_interval=0: give a large number for no evaluation during training")
+    for section, value in config.loss.items():
+        if value is None and str(config.loss.get("_target_")).endswith(".VG2GTLoss"):  # the defaults of its class
+            raise ValueError(f"loss.{section}=null does not turn anything off: set the weights in loss.{section} to 0")
 
 
 @memory_advice(TRAINING)
@@ -239,8 +219,8 @@ def check_run(run: Run) -> None:
             refuse_without_hints(run.module.model, source)
     if not run.module.model.trained_parameters():
         raise ValueError(
-            f"{type(run.module.model).__name__} has no trained part: evaluate it with vg2gt evaluate, "
-            "or choose another model="
+            f"{type(run.module.model).__name__} has no trained part: evaluate it with vg2gt evaluate, or choose "
+            "another model="
         )
 
 
@@ -287,19 +267,16 @@ def report(run: Run, untrained: dict[str, float], trained: dict[str, float]) -> 
     }
     if run.trainer.is_global_zero and not run.trial:
         write_json(run.folder / "metrics.json", content)
-        write_text(run.folder / "metrics.md", comparison_table(untrained, trained))
-        print_comparison(untrained, trained)
+        table = comparison_table(untrained, trained)
+        write_text(run.folder / "metrics.md", table)
+        print(table)
         run.module.to(run.trainer.strategy.root_device)  # the strategy's teardown moved it to the CPU
         preview = write_preview(run.module, run.datamodule, run.folder / "preview.png")
-        newest = newest_valid(run.folder / "checkpoints")
         _log_picture(run, preview)
-        for name, path in (
-            ("preview (input | rendered colour | depth | normals | ground truth)", preview),
-            ("checkpoint", newest),
-            ("metrics", run.folder / "metrics.json"),
-        ):
-            print(f"{name}: {path}")
-        print(f"curves: {_where_curves_are(run)}")
+        print(f"preview ({PANELS}): {preview}")
+        print(f"checkpoint: {newest_valid(run.folder / 'checkpoints')}")
+        print(f"metrics: {run.folder / 'metrics.json'}")
+        print(f"curves: {', '.join(str(logger.log_dir or logger.save_dir) for logger in run.trainer.loggers)}")
     return content
 
 
@@ -312,21 +289,3 @@ def _log_picture(run: Run, picture: Path) -> None:
             logger.experiment.flush()  # training has ended, so nothing else flushes it
         elif isinstance(logger, WandbLogger):
             logger.log_image("preview", [str(picture)], run.trainer.global_step)
-
-
-def _where_curves_are(run: Run) -> str:
-    """Command or folder that shows the training curves of the run's logger."""
-    if any(isinstance(logger, TensorBoardLogger) for logger in run.trainer.loggers):
-        return f"tensorboard --logdir {run.folder}"
-    if any(isinstance(logger, WandbLogger) for logger in run.trainer.loggers):
-        return f"{run.folder / 'wandb'} (offline runs: wandb sync)"
-    return f"{run.folder / 'logs'} (as plots with logger=tensorboard or logger=wandb)"
-
-
-def _check_loggers(config: DictConfig) -> None:
-    """Raises ImportError if a logger's package is missing, naming the extra that installs it."""
-    for logger in config.logger.values():
-        target = str(logger.get("_target_", "")) if logger else ""
-        for ending, package in LOGGER_PACKAGES.items():
-            if target.endswith(ending) and importlib.util.find_spec(package) is None:
-                raise ImportError(f"logger={package} needs {package}: pip install 'vg2gt[log]'")

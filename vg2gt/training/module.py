@@ -42,7 +42,7 @@ class VG2GTModule(lightning.LightningModule):
         loss: training objective.
         renderer: renders the training and evaluation views.
         optimizer: builds the optimiser from parameter groups (Hydra partial); its ``lr`` is the initial learning rate.
-        final_lr: learning rate at the end of the cosine schedule; > 0.
+        final_lr: learning rate at the end of the cosine schedule.
         warmup_steps: steps of linear warm-up; 0 for none.
         coarse_lr_factor: multiplies the learning rate of the coarse module; > 0.
         backend_lr_factor: multiplies the learning rate of the backbone, if it is trained; > 0.
@@ -81,15 +81,18 @@ class VG2GTModule(lightning.LightningModule):
         self.lr_factors = {"coarse": coarse_lr_factor, "backend": backend_lr_factor}
         for name, factor in self.lr_factors.items():
             if not 0 < factor < math.inf:  # the optimiser only checks its own learning rate
-                raise ValueError(
-                    f"training.{name}_lr_factor={factor} must be a positive number; 1 is the optimiser's rate"
-                )
-        _check_steps(final_lr, warmup_steps, render_views)
+                raise ValueError(f"training.{name}_lr_factor={factor} must be a positive number")
+        if render_views is not None and render_views < 1:
+            raise ValueError(f"training.render_views={render_views} must be at least 1, or null for all")
+        if part not in get_args(Part) or (pose_noise and part == "all") or not 0 <= pose_noise <= 1:
+            raise ValueError(
+                f"training.part={part} must be all or coarse, and training.pose_noise={pose_noise} a fraction of the "
+                "scenes, 0 with part=all: rendered views need accurate cameras to match the images"
+            )
         self.model = model
         self.part = part
         if part == "coarse":
             _leave_only_coarse(model)
-        _check_part(part, pose_noise)
         self.pose_noise = pose_noise
         self.loss = loss
         self.renderer = renderer
@@ -179,20 +182,21 @@ class VG2GTModule(lightning.LightningModule):
         figures |= {f"train/{name}": value for name, value in report.terms.items()}
         figures |= {f"train/{what}_dropped": float(count) for what, count in dropped_by(self.model).items()}
         figures["train/scenes_without_depth"] = report.skipped * world_size()
-        return {name: self._figure(value) for name, value in figures.items()}
+        return self._scalars(figures)
 
     def _scene_figures(self, batch: Batch, prediction: Prediction) -> dict[str, Tensor]:
         """Gaussians per context view and voxels per pixel."""
         figures = {"train/gaussians_per_view": len(prediction.gaussians) / (len(batch.scene) * batch.num_context)}
         if prediction.voxels is not None:
             figures["train/voxels_per_pixel"] = len(prediction.voxels.grid) / batch.context.depth.numel()
-        return {name: self._figure(value) for name, value in figures.items()}
+        return self._scalars(figures)
 
-    def _figure(self, value: Tensor | float) -> Tensor:
-        """Converts to a float32 scalar; numbers are created on the device, as a copy would make the host wait."""
-        if isinstance(value, Tensor):
-            return value.to(torch.float32)
-        return torch.full((), value, dtype=torch.float32, device=self.device)
+    def _scalars(self, figures: Mapping[str, Tensor | float]) -> dict[str, Tensor]:
+        """Converts to float32; numbers are created on the device, as a copy would make the host wait."""
+        return {
+            name: value.float() if isinstance(value, Tensor) else torch.full((), value, device=self.device)
+            for name, value in figures.items()
+        }
 
     def _log_step(self, average: bool) -> None:
         """Logs the step's values: means over ranks, or this rank's own values if the step was skipped."""
@@ -256,8 +260,9 @@ class VG2GTModule(lightning.LightningModule):
         """Evaluates a batch of scenes on their held-out views."""
         for index, scene in enumerate(batch.scene):
             sample = (scene, *batch.frame_ids[index].tolist())
-            metrics = evaluate_scene(self.model, self.renderer, batch.single(index), self.rasterized_depth)
-            self._metrics[sample] = metrics
+            self._metrics[sample] = evaluate_scene(
+                self.model, self.renderer, batch.single(index), self.rasterized_depth
+            )
 
     def on_validation_epoch_end(self) -> None:
         """Logs means over the scenes of all ranks, in the order of a single process, as ``eval/<name>``."""
@@ -295,29 +300,3 @@ def _leave_only_coarse(model: Reconstructor) -> None:
         )
     for name, parameter in model.named_parameters():
         parameter.requires_grad_(parameter.requires_grad and name.startswith("coarse."))
-
-
-def _check_steps(final_lr: float, warmup_steps: int, render_views: int | None) -> None:
-    """Raises ValueError for an invalid schedule or number of rendered views."""
-    if not 0 < final_lr < math.inf:
-        raise ValueError(f"training.final_lr={final_lr} must be a positive number, such as 1e-8 to end near 0")
-    if type(warmup_steps) is not int or warmup_steps < 0:
-        raise ValueError(f"training.warmup_steps={warmup_steps} must be a whole number of steps; 0 for no warm-up")
-    if render_views is not None and (type(render_views) is not int or render_views < 1):
-        raise ValueError(
-            f"training.render_views={render_views} must be at least 1, or null for all; training.part=coarse or "
-            "loss.gaussian.weight=0 train without rendered views"
-        )
-
-
-def _check_part(part: str, pose_noise: float) -> None:
-    """Raises ValueError for an unknown part or an invalid pose noise."""
-    if part not in get_args(Part):
-        raise ValueError(f"training.part={part} is unknown: choose one of {', '.join(get_args(Part))}")
-    if not 0 <= pose_noise <= 1:
-        raise ValueError(f"training.pose_noise={pose_noise} must be a fraction of the scenes, from 0 to 1")
-    if pose_noise and part == "all":
-        raise ValueError(
-            f"training.pose_noise={pose_noise} requires training.part=coarse: rendered views need accurate "
-            "cameras to match the images"
-        )

@@ -8,10 +8,11 @@ from pathlib import Path
 import torch
 from lightning.pytorch import LightningDataModule
 
+from vg2gt.evaluation.pictures import panels
 from vg2gt.evaluation.protocols import ground_truth_target_cameras
-from vg2gt.evaluation.tables import columns, markdown_table, number, print_table
+from vg2gt.evaluation.tables import columns, markdown_table, number
 from vg2gt.geometry.precision import half_precision_on_gpu
-from vg2gt.io.images import colorize_depth, colorize_normals, grid, write_png
+from vg2gt.io.images import grid, write_png
 from vg2gt.training.module import VG2GTModule
 from vg2gt.types import Batch
 
@@ -41,11 +42,6 @@ def _rows(untrained: dict[str, float], trained: dict[str, float]) -> list[list[s
         shown = [number(before, metric.decimals), number(after, metric.decimals)]
         rows.append([metric.label, *shown, number(change, metric.decimals, sign=True) + relative])
     return rows
-
-
-def print_comparison(untrained: dict[str, float], trained: dict[str, float]) -> None:
-    """Prints the table to the terminal."""
-    print_table(HEAD, _rows(untrained, trained), title="untrained head -> trained head", caption=CAPTION)
 
 
 def comparison_table(untrained: dict[str, float], trained: dict[str, float]) -> str:
@@ -82,13 +78,4 @@ def _row(module: VG2GTModule, batch: Batch) -> list[torch.Tensor]:
     middle = (batch.images.shape[1] - batch.num_context) // 2
     cameras = ground_truth_target_cameras(batch, prediction).select(slice(middle, middle + 1))
     rendered = module.renderer(prediction.gaussians, cameras)
-    depth = rendered.depth[0, 0]
-    visible = depth[depth > 0]
-    near, far = (float(visible.quantile(q)) for q in (0.02, 0.98)) if visible.numel() else (0.0, 1.0)
-    return [
-        batch.images[0, 0],
-        rendered.color[0, 0],
-        colorize_depth(depth, near, far),
-        colorize_normals(rendered.normal[0, 0]),
-        batch.target.images[0, middle],
-    ]
+    return panels(batch.images[0, 0], rendered, 0, batch.target.images[0, middle])

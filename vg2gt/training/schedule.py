@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from torch import nn
-
-Named = tuple[str, nn.Parameter]
 
 
 def cosine_with_warmup(steps: int, warmup_steps: int, final_factor: float) -> Callable[[int], float]:
@@ -41,21 +39,21 @@ def parameter_groups(module: nn.Module, factors: Mapping[str, float] | None = No
         Groups with named parameters as ``params``.
     """
     apart = {name: factor for name, factor in (factors or {}).items() if factor != 1}
-    parameters = [(name, parameter) for name, parameter in module.named_parameters() if parameter.requires_grad]
-    groups = _by_decay(named for named in parameters if _child(named) not in apart)
-    for child, factor in apart.items():
-        groups += [group | {"lr_factor": factor} for group in _by_decay(n for n in parameters if _child(n) == child)]
+    groups = []
+    for child in ("", *apart):
+        for decays in (True, False):
+            parameters = [
+                (name, parameter)
+                for name, parameter in module.named_parameters()
+                if parameter.requires_grad and (parameter.dim() > 1) is decays and _child(name, apart) == child
+            ]
+            if parameters:
+                options = ({} if decays else {"weight_decay": 0.0}) | ({"lr_factor": apart[child]} if child else {})
+                groups.append({"params": parameters, **options})
     return groups
 
 
-def _child(named: Named) -> str:
-    return named[0].partition(".")[0]
-
-
-def _by_decay(parameters: Iterable[Named]) -> list[dict[str, Any]]:
-    named = list(parameters)
-    groups = [
-        {"params": [(name, parameter) for name, parameter in named if parameter.dim() > 1]},
-        {"params": [(name, parameter) for name, parameter in named if parameter.dim() <= 1], "weight_decay": 0.0},
-    ]
-    return [group for group in groups if group["params"]]
+def _child(name: str, apart: Mapping[str, float]) -> str:
+    """The child module of a parameter's name if it is one of ``apart``, else an empty string."""
+    child = name.partition(".")[0]
+    return child if child in apart else ""

@@ -23,10 +23,8 @@ from vg2gt.runs.checkpoints import (
 )
 from vg2gt.runs.load import RESUMED_IN_PLACE, earlier_configs, refuse_other_tokens
 from vg2gt.runs.trust import read_run_config
-from vg2gt.training.checkpointing import BEST
 from vg2gt.training.module import VG2GTModule
 
-OPTIMIZER = "optimizer._target_"
 IN_OPTIMIZER = ("training.part", "training.coarse_lr_factor", "training.backend_lr_factor", "backend.freeze")
 """Keys besides ``optimizer.*`` that a checkpoint's optimiser state determines, so that a resumed run ignores them."""
 HARDWARE = "optimizer.fused"  # set by trainer=gpu; does not change what is computed
@@ -53,14 +51,14 @@ def checkpoint_to_resume(config: DictConfig) -> Path | None:
     elif config.ckpt == "auto":
         log.info("ckpt=auto: no checkpoint in %s yet, the run starts from the beginning", folder)
         return None
-    elif config.ckpt:
-        path = Path(config.ckpt)
-    elif old and not config.trainer.get("fast_dev_run") and not config.overwrite:
-        raise FileExistsError(
-            f"{folder} already holds a run ({len(old)} checkpoints): resume with ckpt=last, choose another name=, "
-            "or replace it with overwrite=true"
-        )
     else:
+        path = checkpoint_path(config.ckpt)
+    if path is None:
+        if old and not config.trainer.get("fast_dev_run") and not config.overwrite:
+            raise FileExistsError(
+                f"{folder} already holds a run ({len(old)} checkpoints): resume with ckpt=last, choose another name=, "
+                "or replace it with overwrite=true"
+            )
         return None
     step, most = read_checkpoint(path)["global_step"], config.trainer.max_steps
     if old and not (path.resolve().parent == folder.resolve() and path.name == newest_valid(folder).name):
@@ -89,21 +87,8 @@ def load_start(module: VG2GTModule, config: DictConfig, checkpoint: Path | None)
         refuse_other_tokens(config.backend, content, checkpoint)
         module.model.load_trained(model_state(content["state_dict"]), content.get("backend"))
         name_differences(config, checkpoint)
-    elif config.init_from:
-        initialize_from(module, _initial(config.init_from))
-
-
-def _initial(path: str) -> str | Path:
-    """The file of initial weights: ``path``, or the newest checkpoint if it is a run's folder."""
-    if not Path(path).is_dir():
-        return path
-    try:
-        return checkpoint_path(path) or path
-    except FileNotFoundError as error:
-        raise FileNotFoundError(
-            f"init_from={path} holds no valid checkpoint: give a run's folder such as outputs/quickstart, or a "
-            "checkpoint's file"
-        ) from error
+    elif (start := checkpoint_path(config.init_from, "init_from")) is not None:
+        initialize_from(module, start)
 
 
 def prepare_folder(config: DictConfig, checkpoint: Path | None) -> None:
@@ -129,9 +114,8 @@ def prepare_folder(config: DictConfig, checkpoint: Path | None) -> None:
             path.rename(f"{path}.damaged")
             log.warning("%s is damaged and was renamed to *.damaged; continuing from %s", path, checkpoint.name)
     elif old:
-        for path in old:
-            path.unlink()
-        (folder / "checkpoints" / BEST).unlink(missing_ok=True)
+        for path in [*old, folder / "checkpoints" / "best.ckpt"]:
+            path.unlink(missing_ok=True)
         shutil.rmtree(folder / "logs", ignore_errors=True)
         (folder / "metrics.json").unlink(missing_ok=True)
     write_text(current, OmegaConf.to_yaml(config, resolve=True))
@@ -152,30 +136,19 @@ def _origin(config: DictConfig) -> dict[str, Any]:
     }
 
 
-def name_differences(config: DictConfig, checkpoint: Path | None = None) -> None:
+def name_differences(config: DictConfig, checkpoint: Path) -> None:
     """Logs how a resumed run's configuration differs from that of the checkpoint's run.
 
-    Args:
-        config: configuration of the resumed run.
-        checkpoint: where it resumes; None: a checkpoint in its own folder.
-
     Raises:
-        ValueError: if the optimiser, or an option that its restored state would override, differs.
+        ValueError: if an option that the restored state of the optimiser would override differs.
     """
-    path = Path(config.output_dir) / "config.yaml"
-    if checkpoint is not None and not _in_place(config, checkpoint):
-        path = run_config_path(checkpoint)
+    path = run_config_path(checkpoint)
     if not path.is_file():
         return
     before, now = (flatten(OmegaConf.to_container(c, resolve=True)) for c in (read_run_config(path), config))
-    if before.get(OPTIMIZER, now.get(OPTIMIZER)) != now.get(OPTIMIZER):
-        raise ValueError(
-            f"the run was trained with {before[OPTIMIZER]} and cannot resume with {now[OPTIMIZER]}: start a new run "
-            "from its weights with name= and init_from="
-        )
     different = sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))
     for key in different:
-        of_optimizer = OPTIMIZER in before and key.startswith("optimizer.") and key != HARDWARE
+        of_optimizer = "optimizer._target_" in before and key.startswith("optimizer.") and key != HARDWARE
         if of_optimizer or (key in IN_OPTIMIZER and key in before and key in now):
             raise ValueError(
                 f"{key}={now.get(key, 'not set')} differs from {before.get(key, 'not set')}, with which the run was "
