@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from tests.training_helpers import small_config
-from vg2gt.evaluation.evaluator import SceneEvaluator, SceneResult
-from vg2gt.evaluation.options import EvaluationOptions
+from vg2gt.evaluation.evaluator import EvaluationOptions, SceneEvaluator, SceneResult
 from vg2gt.training.loop import build
 from vg2gt.training.module import VG2GTModule
 from vg2gt.types import Batch

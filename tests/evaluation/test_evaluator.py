@@ -5,9 +5,8 @@ import pytest
 import torch
 
 from tests.evaluation.conftest import without_cost
-from vg2gt.evaluation.evaluator import MODES, PROTOCOLS, SceneEvaluator, SceneResult
+from vg2gt.evaluation.evaluator import MODES, PROTOCOLS, EvaluationOptions, PointOptions, SceneEvaluator, SceneResult
 from vg2gt.evaluation.in_training import evaluate_scene
-from vg2gt.evaluation.options import EvaluationOptions, PointOptions
 from vg2gt.evaluation.protocols import ground_truth_target_cameras, joint_target_cameras
 from vg2gt.evaluation.scene_metrics import align_geometry, image_metrics, point_cloud_metrics
 from vg2gt.geometry.alignment import Similarity

@@ -8,7 +8,7 @@ from tests.commands import ROOT
 from vg2gt.config import compose, group_options
 from vg2gt.data.views.drawn import index_path
 from vg2gt.evaluation import paper
-from vg2gt.evaluation.options import EvaluationOptions
+from vg2gt.evaluation.evaluator import EvaluationOptions
 
 EXAMPLES = ROOT / "examples" / "data_sets" / "configs"
 PLUGINS = sorted(path.stem for path in (EXAMPLES / "evaluation").iterdir())
@@ -38,11 +38,11 @@ def test_the_papers_presets_are_the_papers(preset: str) -> None:
     options: EvaluationOptions = instantiate(config.evaluation, _convert_="all")
     assert options.table == preset
     read = {
-        "source": get_class(config.data.val._target_).__name__,
+        "data": get_class(config.data.val._target_).__name__,
         "size": (config.data.image_size[0], config.data.image_size[1]),
         "fit": config.data.fit,
         "alignment": options.alignment,
         "depth_range": options.depth_range,
     }
-    assert paper.obstacle(preset, **read, told=False) is None
-    assert paper.obstacle(preset, **read, told=True) is not None
+    assert paper.obstacle(preset, read | {"told": False}) is None
+    assert paper.obstacle(preset, read | {"told": True}) is not None

@@ -110,27 +110,23 @@ def test_more_scenes_views_and_pictures_join_other_settings_do_not(cache: Path, 
     assert len(list((joined / "scenes" / "2").iterdir())) == 1
 
 
-def test_refined_rows_stand_apart(tmp_path: Path, cache: Path, trained: Path, joined: Path) -> None:
-    few = [f"ckpt={trained}", "data.eval_scenes=1", "views=[3]"]
+def test_refined_rows_stand_apart_and_the_papers_not_beside_other_data(tmp_path, cache, trained, joined) -> None:
+    few = [f"ckpt={trained}", "data.eval_scenes=1", "views=[3]", "evaluation.table=replica"]
     report = run(tmp_path, cache, *few, "evaluation.refine=2")
+    assert report["settings"]["paper"] is None
     mean = report["views"]["3"]["mean"]
     assert mean["refined/rendered/gt_pose/solid/psnr"] != mean["rendered/gt_pose/solid/psnr"]
     text = (tmp_path / "metrics.md").read_text()
     assert "optimised on the input views, 2 steps; not feed-forward" in text
-    assert "| solid, refined " in text
+    assert "| 3, refined | gt_pose " in text
+    assert "refine [s]" in text
+    assert "the paper's rows are left out: the data is read by SyntheticScenes" in text
+    assert "tbl_" not in text
     with pytest.raises(FileExistsError, match=r"evaluation\.refine \(2 -> "):
         run(tmp_path, cache, *few, "evaluation.refine=3")
     # Where nothing is refined, options of refinement decide nothing.
     run(joined, cache, f"ckpt={trained}", "refine.rates.sh=1")
     assert "refined" not in (joined / "metrics.md").read_text()
-
-
-def test_the_papers_rows_do_not_stand_beside_other_data(tmp_path: Path, cache: Path, trained: Path) -> None:
-    chosen = ["evaluation.table=replica", "data.eval_scenes=1", "views=[3]"]
-    assert run(tmp_path, cache, f"ckpt={trained}", *chosen)["settings"]["paper"] is None
-    text = (tmp_path / "metrics.md").read_text()
-    assert "the paper's rows are left out: the data is read by SyntheticScenes" in text
-    assert "tbl_" not in text
 
 
 def test_a_model_without_a_trained_part(tmp_path: Path, cache: Path) -> None:

@@ -28,7 +28,7 @@ def report(**settings: Any) -> dict[str, Any]:
         "scenes": 1,
         "index": "replica",
         "size": [518, 518],
-        "crop": "cover",
+        "fit": "cover",
         "alignment": "median",
         "depth_range": [None, None],
         "neighbors": 8,
@@ -47,8 +47,8 @@ def test_figures_stand_where_they_belong() -> None:
     assert re.search(r"\| 3 +\| gt_pose +\| solid +\| +0\.0123 \|.* 0\.9876 \|", text)
     assert re.search(r"\| 10 +\| gt_pose +\| rasterized \| +24\.00 \| +n/a \| +n/a \|", text)
     assert re.search(r"\| room +\| 3 +\| +25\.50 \|", text)
-    assert "alignment median, of any true depth" in text
-    assert "threshold 0.05, cap none" in text
+    assert "alignment median, true depths from 0 to any" in text
+    assert "threshold 0.05, cap None" in text
     assert "k = 8" in text
     assert "## Cameras of the input views\n\nn/a" in text
     assert "paper" not in text
@@ -68,7 +68,7 @@ def test_the_papers_rows_stand_beside_ours() -> None:
 
 
 PAPERS = {
-    "source": "Replica",
+    "data": "Replica",
     "size": (518, 518),
     "fit": "cover",
     "alignment": "median",
@@ -80,8 +80,8 @@ PAPERS = {
 @pytest.mark.parametrize(
     ("key", "value", "told"),
     [
-        ("source", "SyntheticScenes", "read by SyntheticScenes, which is not the paper's replica"),
-        ("source", "ScanNet", "read by ScanNet"),
+        ("data", "SyntheticScenes", "read by SyntheticScenes, which is not the paper's replica"),
+        ("data", "ScanNet", "read by ScanNet"),
         ("size", (112, 224), "images are 112x224"),
         ("fit", "pad", "518x518 \\(pad\\)"),
         ("alignment", "none", "aligned by none"),
@@ -90,8 +90,8 @@ PAPERS = {
     ],
 )
 def test_only_the_papers_protocol_may_stand_beside_the_paper(key: str, value: Any, told: str) -> None:
-    assert paper.obstacle("replica", **PAPERS) is None
-    assert re.search(told, paper.obstacle("replica", **PAPERS | {key: value}) or "")
+    assert paper.obstacle("replica", PAPERS) is None
+    assert re.search(told, paper.obstacle("replica", PAPERS | {key: value}) or "")
     assert "the paper's rows are left out: because" in report_markdown(report(paper_obstacle="because"))
 
 

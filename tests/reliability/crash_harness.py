@@ -34,7 +34,7 @@ RUN = [
     "trainer.val_check_interval=4",
 ]
 
-TRAIN, EVALUATE = "vg2gt.cli.train", "vg2gt.cli.evaluate"
+TRAIN = "vg2gt.cli.train"
 
 Moment = Callable[["Attempt"], bool]
 

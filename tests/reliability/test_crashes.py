@@ -4,14 +4,12 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from tests.reliability import crash_harness as harness
-from tests.reliability.crash_harness import EVALUATE, TRAIN, Moment
-from vg2gt.io.files import read_json
+from tests.reliability.crash_harness import TRAIN, Moment
 
 
 @dataclass(frozen=True)
@@ -109,38 +107,3 @@ def test_twenty_kills(tmp_path: Path, cache: Path, whole: Path) -> None:
     print(f"{sum(kills.values())} kills survived, every result equal bit for bit")
     assert sum(kills.values()) >= 20
     assert all(kills.values()), kills
-
-
-def without_cost(node: Any) -> Any:
-    """Without times and memory."""
-    if isinstance(node, dict):
-        return {k: without_cost(v) for k, v in node.items() if not k.endswith(("_seconds", "_mib"))}
-    return node
-
-
-@pytest.mark.slow
-def test_a_killed_evaluation_goes_on(tmp_path: Path, cache: Path, whole: Path) -> None:
-    run, expected, folder = tmp_path / "run", tmp_path / "whole", tmp_path / "killed"
-    shutil.copytree(whole, run)
-
-    def arguments(folder: Path) -> list[str]:
-        small = ["data.image_size=[28,56]", "data.eval_scenes=5", "views=[2]", "device=cpu", "name=test"]
-        places = [f"output_dir={folder}", f"hydra.run.dir={folder}", f"data.cache_dir={cache}", f"ckpt={run}"]
-        return [*small, *places, "evaluation.pictures=2"]
-
-    harness.finish(EVALUATE, arguments(expected), expected)
-    kills = 0
-    for _ in range(4):
-        attempt = harness.start(EVALUATE, arguments(folder), folder)
-        if attempt.wait_for(lambda running: any(name.startswith("scenes/2/") for name in running.new())):
-            attempt.kill()  # a scene is evaluated
-        assert attempt.status() in (0, -9), attempt.said()[-4000:]
-        kills += attempt.status() == -9
-    harness.finish(EVALUATE, arguments(folder), folder)
-    results = [read_json(path / "metrics.json") for path in (expected, folder)]
-    for result in results:
-        del result["settings"]["name"]  # that of the folder
-    assert without_cost(results[0]) == without_cost(results[1])
-    for path in (expected / "pictures").iterdir():
-        assert path.read_bytes() == (folder / "pictures" / path.name).read_bytes()
-    assert kills >= 3

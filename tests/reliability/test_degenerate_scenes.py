@@ -10,9 +10,8 @@ from torch import Tensor, nn
 
 from tests.reliability.degenerate import SCENES, beside, obey_names, random_mutation
 from tests.reliability.steps import first_batches, fit, tiny_run
-from vg2gt.evaluation.evaluator import SceneEvaluator
+from vg2gt.evaluation.evaluator import EvaluationOptions, SceneEvaluator
 from vg2gt.evaluation.in_training import evaluate_scene
-from vg2gt.evaluation.options import EvaluationOptions
 from vg2gt.model import VG2GT, Reconstructor
 from vg2gt.rendering import Renderer
 from vg2gt.training.loop import Run

@@ -1,13 +1,11 @@
 """Two processes train like one with twice the scenes, and end together; a batch of two scenes is the mean of two."""
 
 import os
-import signal
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
 
-import lightning
 import pytest
 import torch
 from torch import Tensor
@@ -18,7 +16,6 @@ from tests.reliability.degenerate import SCENES
 from tests.reliability.steps import TINY, first_batches, tiny_run
 from tests.training_helpers import SMALL
 from vg2gt.losses import EnhancementLoss, GaussianLoss, ScaleAlignment, VG2GTLoss
-from vg2gt.training.checkpointing import StopOnSignal
 from vg2gt.training.distributed import interleave
 from vg2gt.training.loop import Run
 from vg2gt.types import Batch
@@ -206,26 +203,6 @@ def test_an_error_of_one_rank_ends_both(two) -> None:
 def test_what_ranks_hold_is_interleaved() -> None:
     joined = interleave([{"a": 1, "c": 3, "e": 5}, {"b": 2, "d": 4}, {"a": 9}])
     assert list(joined.items()) == [("a", 1), ("b", 2), ("c", 3), ("d", 4), ("e", 5)]
-
-
-# ---------------------------------------------------------------------------------------------------------- clusters
-
-
-class Announced(lightning.Callback):
-    """Sends the signal of SLURM's ``--signal=USR1`` in the second step."""
-
-    def on_train_batch_start(self, trainer: lightning.Trainer, *args: object) -> None:
-        if trainer.global_step == 1:
-            signal.raise_signal(signal.SIGUSR1)
-
-
-def test_the_announced_end_of_a_job_saves_after_the_step(tmp_path: Path, cache: Path) -> None:
-    run = tiny_run(tmp_path, cache, "trainer.max_steps=5")
-    run.trainer.callbacks += [StopOnSignal(), Announced()]  # pyright: ignore[reportAttributeAccessIssue]
-    before = signal.getsignal(signal.SIGUSR1)
-    run.trainer.fit(run.module, datamodule=run.datamodule)
-    assert [path.name for path in tmp_path.rglob("*.ckpt")] == ["step-2.ckpt"]
-    assert signal.getsignal(signal.SIGUSR1) == before
 
 
 # ------------------------------------------------------------------------------------------------------------- slow

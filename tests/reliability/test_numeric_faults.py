@@ -15,8 +15,8 @@ from tests.reliability.crash_harness import assert_equal
 from tests.reliability.steps import TINY, Poison, first_batches, fit, named, tiny_run
 from tests.training_helpers import small_config, with_crash
 from vg2gt.runs.checkpoints import newest_valid, read_checkpoint
+from vg2gt.training.distributed import Fault
 from vg2gt.training.loop import Run, train
-from vg2gt.training.skipped import Fault
 from vg2gt.types import Batch
 
 VALUES = (float("nan"), float("inf"), -float("inf"))
@@ -48,7 +48,7 @@ def test_a_bad_value_in_the_data_drops_the_step(run: Run, caplog: pytest.LogCapt
     assert audit.skipped == [False, *([True] * len(bad)), False]
     for i in range(len(PARTS)):
         assert f"skipped step {i + 1} with non-finite values: rank 0, room-{i}: images, depth or cameras" in caplog.text
-    assert run.module.skipped.faults[0] == Fault(("room-0",), "images, depth or cameras of the batch", 1, 0)
+    assert run.module.skipped.faults[0] == Fault(["room-0"], "images, depth or cameras of the batch", 1, 0)
 
 
 Change = Callable[[Any], Any]

@@ -65,13 +65,14 @@ def rows(folder: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGUSR1])  # the last is SLURM's notice
 def test_a_signal_saves_without_another_evaluation(tmp_path: Path, cache: Path, number: signal.Signals) -> None:
-    stopped = HappensAt(3, lambda: signal.raise_signal(number))
+    stopped, before = HappensAt(3, lambda: signal.raise_signal(number)), signal.getsignal(number)
     run = build(small_config(tmp_path, cache, *RUN))
     run.trainer.callbacks.append(stopped)  # pyright: ignore[reportAttributeAccessIssue]
     run.trainer.fit(run.module, datamodule=run.datamodule)
     assert (newest_valid(tmp_path / "checkpoints").name, stopped.evaluations) == ("step-3.ckpt", 0)
+    assert signal.getsignal(number) == before
 
 
 def test_a_killed_process_that_loads_data_is_one_error(tmp_path: Path, cache: Path) -> None:

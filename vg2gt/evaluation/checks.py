@@ -74,13 +74,12 @@ def _ancestry(checkpoint: Path | None) -> Iterator[tuple[Path, DictConfig]]:
 
 def refuse_without_hints(model: Reconstructor, source: SceneSource) -> None:
     """Raises DataError if the data lacks the depth or cameras that a backbone needs."""
-    backend = model.backend
-    needed = {"depth": backend.needs_depth, "cameras": backend.needs_hints}
-    there = {"depth": source.has_depth and source.dense_depth, "cameras": source.has_cameras}
-    lacking = [name for name, needs in needed.items() if needs and not there[name]]
+    backend, sparse = model.backend, source.has_depth and not source.dense_depth
+    lacking = ["depth"] if backend.needs_depth and (sparse or not source.has_depth) else []
+    lacking += ["cameras"] if backend.needs_hints and not source.has_cameras else []
     if lacking:
         raise DataError(
             f"backend {backend.name} needs the data's {' and '.join(lacking)}, and {type(source).__name__} has none"
-            + (" (depth at sparse points is not enough)" if source.has_depth and not source.dense_depth else "")
+            + (" (depth at sparse points is not enough)" if sparse else "")
             + ": choose another backend=, such as sweep, or other data"
         )

@@ -1,15 +1,15 @@
-"""Reconstruction and scoring of one scene for ``vg2gt evaluate``."""
+"""Reconstruction and scoring of one scene for ``vg2gt evaluate``, and its options."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 
 import torch
 
+from vg2gt.data.views.drawn import ViewSelection
 from vg2gt.evaluation.in_training import CV_QUERIES, render_or_nan
-from vg2gt.evaluation.options import EvaluationOptions
 from vg2gt.evaluation.protocols import ground_truth_target_cameras, joint_target_cameras
 from vg2gt.evaluation.scene_metrics import (
     align_geometry,
@@ -20,6 +20,7 @@ from vg2gt.evaluation.scene_metrics import (
 )
 from vg2gt.geometry.precision import half_precision_on_gpu
 from vg2gt.metrics import LPIPS, camera_metrics, cv, depth_metrics
+from vg2gt.metrics.depth import ALIGNMENTS
 from vg2gt.model import Reconstructor
 from vg2gt.profiling import clocked, now, peak_memory_mib, reset_peak_memory
 from vg2gt.refinement import Observations, RefineOptions, refine
@@ -31,6 +32,71 @@ MODES = ("solid", "rasterized")
 PROTOCOLS = ("novel", "gt_pose", "context")
 
 Metrics = dict[str, float | None]
+
+
+@dataclass(frozen=True)
+class PointOptions:
+    """Options of the point-cloud comparison; lengths are in the data's unit.
+
+    Args:
+        threshold: distance below which a point counts as correct.
+        downsample: edge length of the cells in which one point is kept; None keeps all points.
+        cap: distances of at least this length are left out of the means; None: no cap.
+    """
+
+    threshold: float = 0.05
+    downsample: float | None = 0.02
+    cap: float | None = None
+
+
+@dataclass(frozen=True)
+class EvaluationOptions:
+    """Options of an evaluation.
+
+    Args:
+        selection: selects the views of a scene.
+        alignment: alignment of depth, see :func:`vg2gt.metrics.depth_metrics`; the paper uses ``median``.
+        depth_range: ``(nearest, farthest)`` in the data's unit; true depths outside count as unknown, for depth,
+            normals and points. None: no bound.
+        neighbors: number of neighbours k of the uniformity CV.
+        points: options of the point-cloud comparison.
+        lpips: ``auto`` (weights in torch hub's cache), ``download``, the weights' path, or None: no LPIPS.
+        pictures: number of scenes, for each number of views, of which pictures are written.
+        refine: number of refinement steps; the refined scene is scored in separate rows. 0: no refinement.
+        table: data set in the paper's tables whose rows are printed below ours; None: no rows of the paper.
+
+    Raises:
+        ValueError: if the alignment is unknown or the depth range is empty.
+    """
+
+    selection: ViewSelection = field(default_factory=ViewSelection)
+    alignment: str = "median"
+    depth_range: Sequence[float | None] = (None, None)
+    neighbors: int = 8
+    points: PointOptions = field(default_factory=PointOptions)
+    lpips: str | None = "auto"
+    pictures: int = 0
+    refine: int = 0
+    table: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.alignment not in ALIGNMENTS:
+            raise ValueError(f"evaluation.alignment={self.alignment!r}: choose one of {', '.join(ALIGNMENTS)}")
+        if not 0 <= self.nearest < self.farthest:
+            raise ValueError(
+                f"evaluation.depth_range={list(self.depth_range)} leaves no depth: give [nearest,farthest] with "
+                "0 <= nearest < farthest, null for no bound"
+            )
+
+    @property
+    def nearest(self) -> float:
+        """The nearest true depth that counts."""
+        return self.depth_range[0] or 0.0
+
+    @property
+    def farthest(self) -> float:
+        """The farthest true depth that counts."""
+        return float("inf") if self.depth_range[1] is None else self.depth_range[1]
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -31,36 +31,25 @@ def tables() -> Mapping[str, Any]:
     return read_json(TABLES)
 
 
-def obstacle(
-    dataset: str,
-    *,
-    source: str,
-    size: Sequence[int],
-    fit: str,
-    alignment: str,
-    depth_range: Sequence[float | None],
-    told: bool,
-) -> str | None:
+def obstacle(dataset: str, settings: Mapping[str, Any]) -> str | None:
     """Returns why results cannot be compared with the paper's rows on a data set; None if they can.
 
     Args:
         dataset: name in the tables, such as ``replica``.
-        source: name of the class that reads the evaluated data.
-        size: ``(height, width)`` of the images.
-        fit: how images were brought to this size, ``cover`` or ``pad``.
-        alignment: alignment of depth.
-        depth_range: range of true depths that count.
-        told: whether the backbone is given the data's depth or cameras.
+        settings: ``data`` (name of the class that reads it), ``size`` and ``fit`` of the images, ``alignment`` and
+            ``depth_range`` of an evaluation's report, and whether the backbone is ``told`` the data's depth or cameras.
     """
-    if source not in SOURCES.get(dataset, ()):
-        return f"the data is read by {source}, which is not the paper's {dataset}"
+    size, fit, alignment = settings["size"], settings["fit"], settings["alignment"]
+    if settings["data"] not in SOURCES.get(dataset, ()):
+        return f"the data is read by {settings['data']}, which is not the paper's {dataset}"
     if tuple(size) != RESOLUTION or fit != "cover":
         return f"images are {size[0]}x{size[1]} ({fit}), the paper's 518x518 (cover)"
-    if alignment != ALIGNMENT or any(bound is not None for bound in depth_range):
-        return f"depth is aligned by {alignment} within {list(depth_range)}, the paper's by {ALIGNMENT} without bounds"
-    if told:
-        return "the backbone is given true depth or cameras"
-    return None
+    if alignment != ALIGNMENT or any(bound is not None for bound in settings["depth_range"]):
+        return (
+            f"depth is aligned by {alignment} within {settings['depth_range']}, the paper's by {ALIGNMENT} without "
+            "bounds"
+        )
+    return "the backbone is given true depth or cameras" if settings["told"] else None
 
 
 def rows_by_views(table: str, dataset: str | None, views: int) -> Iterator[tuple[str, Mapping[str, float]]]:

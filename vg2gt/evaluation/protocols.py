@@ -19,7 +19,12 @@ def training_cameras(model: Reconstructor, batch: Batch, prediction: Prediction)
     """Cameras of all views of the batch: context views as predicted, held-out views from a joint pass."""
     if batch.images.shape[1] == batch.num_context:
         return prediction.geometry.cameras
-    return _append(prediction.geometry.cameras, joint_target_cameras(model, batch, prediction))
+    seen, held_out = prediction.geometry.cameras, joint_target_cameras(model, batch, prediction)
+    return Cameras(
+        torch.cat((seen.world_to_camera, held_out.world_to_camera), 1),
+        torch.cat((seen.intrinsics, held_out.intrinsics), 1),
+        seen.size,
+    )
 
 
 @torch.no_grad()
@@ -55,11 +60,3 @@ def ground_truth_target_cameras(batch: Batch, prediction: Prediction) -> Cameras
 
     similarity = align_cameras(context.cameras, prediction.geometry.cameras, scale_of_depth)
     return similarity.apply_cameras(batch.target.cameras)
-
-
-def _append(first: Cameras, second: Cameras) -> Cameras:
-    return Cameras(
-        torch.cat((first.world_to_camera, second.world_to_camera), 1),
-        torch.cat((first.intrinsics, second.intrinsics), 1),
-        first.size,
-    )

@@ -20,8 +20,7 @@ from vg2gt.data.datamodule import SceneDataModule
 from vg2gt.data.views import SceneSample
 from vg2gt.evaluation import paper
 from vg2gt.evaluation.checks import refuse_training_views, refuse_without_hints
-from vg2gt.evaluation.evaluator import SceneEvaluator
-from vg2gt.evaluation.options import EvaluationOptions
+from vg2gt.evaluation.evaluator import EvaluationOptions, SceneEvaluator
 from vg2gt.evaluation.pictures import PANELS, scene_picture
 from vg2gt.evaluation.sections import report_markdown
 from vg2gt.evaluation.store import ResultStore
@@ -92,9 +91,9 @@ def _evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
     refinement = replace(instantiate(config.refine), steps=options.refine, seconds=None) if options.refine else None
     evaluator = SceneEvaluator(model, instantiate(parts["renderer"]), options, lpips, refinement, calibration)
     results = {count: _evaluate_all(evaluator, data, views, store, device) for count, views in samples.items()}
-    settings = _settings(config, options, model, weights, data.source, samples, lpips_label, device)
+    settings = _settings(config, evaluator, weights, data.source, len(samples[counts[0]]))
     report = {
-        "settings": settings,
+        "settings": settings | {"lpips": lpips_label, "device": str(device)},
         "views": {
             str(count): {"mean": mean_metrics(metrics), "scenes": dict(sorted(metrics.items()))}
             for count, metrics in results.items()
@@ -184,43 +183,26 @@ def _evaluate_all(
 
 
 def _settings(
-    config: DictConfig,
-    options: EvaluationOptions,
-    model: Reconstructor,
-    weights: TrainedWeights,
-    source: SceneSource,
-    samples: Mapping[int, Sequence[SceneSample]],
-    lpips: str,
-    device: torch.device,
+    config: DictConfig, evaluator: SceneEvaluator, weights: TrainedWeights, source: SceneSource, scenes: int
 ) -> dict[str, Any]:
-    size = (int(config.data.image_size[0]), int(config.data.image_size[1]))
-    fit = config.data.get("fit", "cover")
-    obstacle = options.table and paper.obstacle(
-        options.table,
-        source=type(source).__name__,
-        size=size,
-        fit=fit,
-        alignment=options.alignment,
-        depth_range=options.depth_range,
-        told=model.backend.needs_hints,
-    )
-    return {
+    """What the report says about an evaluation."""
+    options, model = evaluator.options, evaluator.model
+    settings = {
         "name": Path(config.output_dir).name,
         "weights": str(weights) if model.trained_parameters() else "none: the model has no trained part",
         "model": type(model).__name__,
         "backend": model.backend.identity(),
         "data": type(source).__name__,
-        "scenes": len(next(iter(samples.values()))),
+        "scenes": scenes,
         "index": options.selection.index or f"drawn with seed {options.selection.seed}",
-        "size": size,
-        "crop": "resized to cover, cropped at the centre" if fit == "cover" else "padded",
+        "size": [int(side) for side in config.data.image_size],
+        "fit": config.data.get("fit", "cover"),
         "alignment": options.alignment,
         "depth_range": list(options.depth_range),
         "neighbors": options.neighbors,
-        "lpips": lpips,
         "points": asdict(options.points),
-        "device": str(device),
         "refinement": options.refine,
-        "paper": None if obstacle else options.table,
-        "paper_obstacle": obstacle,
+        "told": model.backend.needs_hints,
     }
+    obstacle = options.table and paper.obstacle(options.table, settings)
+    return settings | {"paper": None if obstacle else options.table, "paper_obstacle": obstacle}

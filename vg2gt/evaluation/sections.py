@@ -24,7 +24,6 @@ COST = columns(
     *("cv", "gaussians", "gaussians_per_pixel", "reconstruct_seconds", "head_seconds", "render_seconds"),
     "peak_memory_mib",
 )
-REFINED_COST = columns("cv", "gaussians", "refine_seconds", "render_seconds", "peak_memory_mib")
 _HELD_OUT, _INPUTS = "rendered/gt_pose/solid", "rendered/context/solid"
 SCENE = columns(
     *(f"{_HELD_OUT}/{name}" for name in ("psnr", "ssim", "abs_rel", "delta_1.05", "coverage", "normal_mean")),
@@ -40,7 +39,6 @@ SCENE = columns(
 # Paths of a section's metrics -> labels of their rows, after the number of views.
 Paths = Mapping[str, Sequence[str]]
 RENDERED = {f"rendered/{protocol}/{mode}": (protocol, mode) for protocol in PROTOCOLS for mode in MODES}
-REFINED = {f"refined/{path}": (protocol, f"{mode}, refined") for path, (protocol, mode) in RENDERED.items()}
 DECODED = {"decoded/before": ("before",), "decoded/after": ("after",)}
 POINT_CLOUDS = {"points/rendered": ("rendered",), "points/decoded": ("decoded",)}
 
@@ -56,10 +54,11 @@ def report_markdown(report: Mapping[str, Any]) -> str:
         images = images | {"lpips": replace(images["lpips"], label=f"LPIPS {settings['lpips']}")}
 
     def rows(paths: Paths, table: str | None = None) -> Rows:
-        """For each number of views our rows, followed by the paper's."""
+        """For each number of views our rows, those of refined scenes, and the paper's."""
         found: Rows = []
         for views, result in by_views:
-            found += [([views, *key], _below(result["mean"], path)) for path, key in paths.items()]
+            for label, prefix in ((views, ""), (f"{views}, refined", "refined/")):
+                found += [([label, *key], _below(result["mean"], prefix + path)) for path, key in paths.items()]
             if table:
                 theirs = paper.rows_by_views(table, dataset, int(views))
                 found += [([views, f"paper, {table}", mode], figures) for mode, figures in theirs]
@@ -69,17 +68,15 @@ def report_markdown(report: Mapping[str, Any]) -> str:
         figures = paper.row(table, dataset, method)
         return [([*key], figures)] if figures else []
 
+    costs = COST | columns("refine_seconds") if settings.get("refinement") else COST
     normals, decoded, cost = (f"paper, {table}" for table in (paper.NORMALS, paper.DECODED, paper.UNIFORMITY))
     rendered = ("views", "protocol", "rendering")
     scenes = [([scene, views], figures) for views, result in by_views for scene, figures in result["scenes"].items()]
     sections = [
-        _section("Rendered depth", rendered, DEPTH, rows(RENDERED | REFINED, paper.DEPTH)),
-        _section("Images", rendered, images, rows(RENDERED | REFINED, paper.IMAGES)),
+        _section("Rendered depth", rendered, DEPTH, rows(RENDERED, paper.DEPTH)),
+        _section("Images", rendered, images, rows(RENDERED, paper.IMAGES)),
         _section(
-            "Rendered normals",
-            rendered,
-            NORMALS,
-            rows(RENDERED | REFINED) + papers_row(paper.NORMALS, "-", normals, "solid"),
+            "Rendered normals", rendered, NORMALS, rows(RENDERED) + papers_row(paper.NORMALS, "-", normals, "solid")
         ),
         _section(
             "Decoded depth of the input views",
@@ -92,36 +89,24 @@ def report_markdown(report: Mapping[str, Any]) -> str:
         _section("Stated errors of the decoded depth", ("views",), STATED, rows({"stated": ()})),
         _section("Cameras of the input views", ("views",), CAMERAS, rows({"cameras": ()})),
         _section("Points of the input views", ("views", "depth"), POINTS, rows(POINT_CLOUDS)),
-        _section("Uniformity and cost", ("views",), COST, rows({"scene": ()}) + papers_row(paper.UNIFORMITY, cost)),
+        _section("Uniformity and cost", ("views",), costs, rows({"scene": ()}) + papers_row(paper.UNIFORMITY, cost)),
         _section("Scenes (solid; held-out views at true poses)", ("scene", "views"), SCENE, scenes),
     ]
-    if settings.get("refinement"):
-        sections[-1:-1] = [
-            _section("Cameras of the input views, refined", ("views",), CAMERAS, rows({"refined/cameras": ()})),
-            _section(
-                "Points of the input views, refined",
-                ("views", "depth"),
-                POINTS,
-                rows({"refined/points/rendered": ("rendered",)}),
-            ),
-            _section("Uniformity and cost, refined", ("views",), REFINED_COST, rows({"refined/scene": ()})),
-        ]
     return "\n".join([_heading(settings), *sections])
 
 
 def _heading(settings: Mapping[str, Any]) -> str:
+    nearest, farthest = settings["depth_range"]
     shown = {
         "weights": settings["weights"],
         "model": settings["model"],
         "backbone": f"{settings['backend']['name']}, weights {settings['backend']['weights'][:12]}",
         "data": f"{settings['data']}, {settings['scenes']} scenes, views {settings['index']}",
-        "images": f"{settings['size'][0]}x{settings['size'][1]}, {settings['crop']}",
-        "depth": f"alignment {settings['alignment']}, {_range(settings['depth_range'])}",
+        "images": f"{settings['size'][0]}x{settings['size'][1]}, fitted to {settings['fit']}",
+        "depth": f"alignment {settings['alignment']}, true depths from {nearest or 0} to {farthest or 'any'}",
         "CV": f"k = {settings['neighbors']}",
         "LPIPS": settings["lpips"],
-        "points": ", ".join(
-            f"{key} {'none' if value is None else f'{value:g}'}" for key, value in settings["points"].items()
-        ),
+        "points": ", ".join(f"{key} {value}" for key, value in settings["points"].items()),
         "device": settings["device"],
     }
     lines = [f"# Evaluation: {settings['name']}", "", *(f"- {name}: {value}" for name, value in shown.items())]
@@ -143,13 +128,6 @@ def _heading(settings: Mapping[str, Any]) -> str:
     if settings["paper_obstacle"]:
         lines.append(f"- the paper's rows are left out: {settings['paper_obstacle']}")
     return "\n".join([*lines, ""])
-
-
-def _range(bounds: Sequence[float | None]) -> str:
-    nearest, farthest = bounds
-    if nearest is None and farthest is None:
-        return "of any true depth"
-    return f"of true depths from {nearest or 0} to {'any' if farthest is None else farthest}"
 
 
 def _section(title: str, keys: Sequence[str], shown: Mapping[str, Metric], rows: Rows) -> str:

@@ -18,7 +18,7 @@ from vg2gt.config import compose, flatten
 from vg2gt.evaluation.tables import Metric, markdown_table, number
 from vg2gt.io.files import read_json, write_json, write_text
 from vg2gt.io.tensors import tensors_digest
-from vg2gt.runs.checkpoints import newest_valid, read_checkpoint, write_checkpoint
+from vg2gt.runs.checkpoints import read_checkpoint, write_checkpoint
 from vg2gt.runs.trust import read_run_config
 from vg2gt.training.loop import build, evaluate, train
 from vg2gt.training.start import load_start
@@ -107,15 +107,8 @@ def _refuse_other_run(config: DictConfig, folder: Path) -> None:
 
 
 def final_checkpoint(folder: Path, steps: int) -> Path:
-    """Returns the last checkpoint of a finished run of ``steps`` steps; ValueError if the newest is of another step."""
-    path = newest_valid(folder / "checkpoints")
-    reached = read_checkpoint(path)["global_step"]
-    if reached != steps:
-        raise ValueError(
-            f"{folder} ran {steps} steps, but its newest valid checkpoint is that of step {reached}: delete the "
-            "folder, and the run is repeated"
-        )
-    return path
+    """Returns the last checkpoint of a finished run of ``steps`` steps."""
+    return folder / "checkpoints" / f"step-{steps}.ckpt"
 
 
 def write_part(start: Path, path: Path, keep: Callable[[str], bool]) -> Path:

@@ -1,18 +1,26 @@
-"""Communication between the processes of a run, other than gradients."""
+"""What the processes of a run agree on, other than gradients: values, skipped steps, their end.
+
+A step with non-finite values is skipped on all ranks: weights and moments stay unchanged. It still counts: data, random
+draws and learning rate advance, so that a resumed run sees the same steps.
+"""
 
 from __future__ import annotations
 
 import signal
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from itertools import zip_longest
 from typing import Any, TypeVar
 
 import lightning
+import torch
 import torch.distributed
+from torch import Tensor
 
 Key = TypeVar("Key")
 Value = TypeVar("Value")
+KEPT = 20  # maximum number of faults in the report of a run
 
 
 def world_size() -> int:
@@ -59,3 +67,70 @@ def ending_together(trainer: lightning.Trainer) -> Iterator[None]:
                 f"data.memory_mb): {str(error).splitlines()[0]}; resume with the same command and ckpt=last"
             ) from error
         raise
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Non-finite values that a rank found in a step.
+
+    Attributes:
+        scenes: scenes of the rank's batch.
+        cause: what is not finite.
+        step: step number.
+        rank: rank that found it.
+    """
+
+    scenes: list[str]
+    cause: str
+    step: int
+    rank: int
+
+    def __str__(self) -> str:
+        return f"rank {self.rank}, {', '.join(self.scenes)}: {self.cause}"
+
+
+def finite(*tensors: Tensor) -> bool:
+    """Returns whether all values are finite; synchronises with the GPU only once if they are."""
+    sums = torch.stack([tensor.detach().sum().float() for tensor in tensors])  # a non-finite value makes the sum so
+    return bool(sums.isfinite().all()) or all(bool(tensor.detach().isfinite().all()) for tensor in tensors)
+
+
+class SkippedSteps:
+    """Counts skipped steps and stops the run after too many in a row.
+
+    Args:
+        limit: number of consecutive skipped steps that stops the run; at least 1.
+
+    Attributes:
+        total: steps skipped since the run began.
+        in_a_row: steps skipped since the last good step.
+        faults: first faults of the run, at most :data:`KEPT`.
+    """
+
+    def __init__(self, limit: int) -> None:
+        if limit < 1:
+            raise ValueError(f"training.max_skipped must be at least 1, got {limit}")
+        self.limit = limit
+        self.total = 0
+        self.in_a_row = 0
+        self.faults: list[Fault] = []
+
+    def add(self, faults: list[Fault]) -> None:
+        """Counts a skipped step; raises FloatingPointError at ``limit`` in a row."""
+        self.total += 1
+        self.in_a_row += 1
+        self.faults = (self.faults + faults)[:KEPT]
+        if self.in_a_row >= self.limit:
+            raise FloatingPointError(
+                f"{self.in_a_row} steps in a row had a non-finite loss or gradient, the last: "
+                f"{'; '.join(map(str, faults))}. Check its scenes, lower optimizer.lr, or raise training.max_skipped"
+            )
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns plain values, for checkpoints and the report of a run."""
+        return {"total": self.total, "in_a_row": self.in_a_row, "faults": [asdict(fault) for fault in self.faults]}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restores the counts from a checkpoint."""
+        self.total, self.in_a_row = state["total"], state["in_a_row"]
+        self.faults = [Fault(**fault) for fault in state["faults"]]

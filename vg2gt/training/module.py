@@ -23,9 +23,8 @@ from vg2gt.model import VG2GT, Reconstructor
 from vg2gt.profiling import stage
 from vg2gt.rendering import Renderer, UnrenderableError
 from vg2gt.runs.checkpoints import MADE_OF, MODEL_PREFIX, model_state
-from vg2gt.training.distributed import all_gather_object, interleave, world_size
+from vg2gt.training.distributed import Fault, SkippedSteps, all_gather_object, finite, interleave, world_size
 from vg2gt.training.schedule import cosine_with_warmup, parameter_groups
-from vg2gt.training.skipped import Fault, SkippedSteps, finite
 from vg2gt.types import Batch, Prediction
 
 log = logging.getLogger(__name__)
@@ -233,7 +232,7 @@ class VG2GTModule(lightning.LightningModule):
     def _skip_step(self) -> None:
         """Counts a skipped step and logs the fault of each rank."""
         cause = self._cause or "gradient"  # averaged, so non-finite on all ranks
-        found = all_gather_object(Fault(self._scenes, cause, self.global_step, self.global_rank))
+        found = all_gather_object(Fault(list(self._scenes), cause, self.global_step, self.global_rank))
         faults = [fault for fault in found if fault.cause != "gradient"] or found
         if self.trainer.is_global_zero:
             log.warning("skipped step %d with non-finite values: %s", self.global_step, "; ".join(map(str, faults)))
