@@ -54,17 +54,13 @@ def survive(case: Case, folder: Path, cache: Path) -> int:
     return kills
 
 
-def test_a_finished_run_stays_as_it_is(tmp_path: Path, cache: Path, whole: Path) -> None:
-    """``ckpt=auto`` once more, as a queue may do: evaluates again, changes nothing."""
+def test_killed_run_equals_uninterrupted(tmp_path: Path, cache: Path, whole: Path) -> None:
+    """And stays as it is when it is started once more, as a queue may do."""
     folder = tmp_path / "run"
-    shutil.copytree(whole, folder)
+    assert survive(QUICK, folder, cache) == len(QUICK.moments)
+    harness.assert_same(whole, folder)
     harness.finish(TRAIN, harness.training(folder, cache), folder)
     harness.assert_same(whole, folder)
-
-
-def test_killed_run_equals_uninterrupted(tmp_path: Path, cache: Path, whole: Path) -> None:
-    assert survive(QUICK, tmp_path / "run", cache) == len(QUICK.moments)
-    harness.assert_same(whole, tmp_path / "run")
 
 
 def test_a_damaged_last_checkpoint_is_set_aside(tmp_path: Path, cache: Path, whole: Path) -> None:

@@ -15,9 +15,23 @@ from vg2gt.runs.checkpoints import initialize_from, newest_valid, read_checkpoin
 from vg2gt.training.start import prepare_folder
 
 
-def test_save_is_atomic_and_reads_back(tmp_path: Path) -> None:
+def test_a_save_reaches_the_disk_in_order_and_reads_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    done: list[str] = []
+    fsync, replace = os.fsync, os.replace
+
+    def noted_fsync(descriptor: int) -> None:
+        done.append(Path(os.readlink(f"/proc/self/fd/{descriptor}")).suffix)
+        fsync(descriptor)
+
+    def noted_replace(source: Path, target: Path) -> None:
+        done.append("rename")
+        replace(source, target)
+
+    monkeypatch.setattr("os.fsync", noted_fsync)
+    monkeypatch.setattr("os.replace", noted_replace)
     path = tmp_path / "checkpoints" / "step-3.ckpt"
     write_checkpoint({"global_step": 3, "state_dict": {"w": torch.arange(4.0)}}, path)
+    assert done == [".tmp", "rename", ""]  # file, name, folder
     assert torch.equal(read_checkpoint(path)["state_dict"]["w"], torch.arange(4.0))
     assert [p.name for p in path.parent.iterdir()] == ["step-3.ckpt"]
 
@@ -33,24 +47,6 @@ def test_failed_write_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.Mon
     with pytest.raises(OSError, match=r"earlier checkpoints are intact"):
         write_checkpoint({"global_step": 4}, path)
     assert (read_checkpoint(path)["global_step"], len(list(tmp_path.iterdir()))) == (3, 1)
-
-
-def test_file_and_folder_reach_the_disk_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    done: list[str] = []
-    fsync, replace = os.fsync, os.replace
-
-    def noted_fsync(descriptor: int) -> None:
-        done.append(Path(os.readlink(f"/proc/self/fd/{descriptor}")).name)
-        fsync(descriptor)
-
-    def noted_replace(source: Path, target: Path) -> None:
-        done.append("rename")
-        replace(source, target)
-
-    monkeypatch.setattr("os.fsync", noted_fsync)
-    monkeypatch.setattr("os.replace", noted_replace)
-    write_checkpoint({"global_step": 3}, tmp_path / "step-3.ckpt")
-    assert done == ["step-3.ckpt.tmp", "rename", tmp_path.name]
 
 
 def test_whatever_bears_the_name_is_passed_over(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -129,9 +129,19 @@ def model_parts(ckpt: str | Path | None, overrides: Sequence[str]) -> tuple[Path
     checkpoint = checkpoint_path(SHIPPED if ckpt is None and suits else ckpt)
     chosen = [override for override, key in zip(overrides, keys, strict=True) if key.partition(".")[0] in named]
     parts = resolve_parts(compose_groups(*chosen) if chosen else OmegaConf.create(), checkpoint)
+    config = OmegaConf.create({part: OmegaConf.to_container(parts[part]) for part in PARTS})
     for override in overrides:
-        if override not in chosen:
-            parts = _changed(parts, override)
+        if override in chosen:
+            continue
+        OmegaConf.set_struct(config, not override.startswith("+"))  # new keys need a leading plus, as in Hydra
+        try:
+            config.merge_with_dotlist([override.lstrip("+")])
+        except (OmegaConfBaseException, ValueError) as error:
+            part = override.lstrip("+").partition(".")[0]
+            raise ValueError(
+                f"option {override!r}: {str(error).splitlines()[0]}; {part} has {', '.join(parts[part])}"
+            ) from error
+    parts = {part: config[part] for part in PARTS}
     if checkpoint is not None and "backend" not in named and of_backend:
         refuse_other_tokens(parts["backend"], read_checkpoint(checkpoint), checkpoint)
     return checkpoint, parts
@@ -143,20 +153,6 @@ def backend_class(ckpt: str | Path | None, overrides: Sequence[str]) -> type:
         return get_class(model_parts(ckpt, overrides)[1]["backend"]["_target_"])
     except ImportError:
         return object
-
-
-def _changed(parts: dict[str, DictConfig], override: str) -> dict[str, DictConfig]:
-    """The parts of a run with ``key=value`` applied; new keys need a leading plus, as in Hydra."""
-    config = OmegaConf.create({part: OmegaConf.to_container(value) for part, value in parts.items()})
-    OmegaConf.set_struct(config, not override.startswith("+"))
-    try:
-        config.merge_with_dotlist([override.lstrip("+")])
-    except (OmegaConfBaseException, ValueError) as error:
-        part = override.lstrip("+").partition(".")[0]
-        raise ValueError(
-            f"option {override!r}: {str(error).splitlines()[0]}; {part} has {', '.join(parts[part])}"
-        ) from error
-    return {part: config[part] for part in parts}
 
 
 def resolve_parts(config: DictConfig, checkpoint: Path | None) -> dict[str, DictConfig]:
