@@ -68,15 +68,6 @@ def test_the_least_opaque_gaussians_of_each_scene_go(caplog: pytest.LogCaptureFi
     assert torch.equal(capped(voxels).means, kept.means)
 
 
-def test_a_scene_is_capped_as_if_it_were_alone() -> None:
-    both = head(50)(some_voxels())
-    first = some_voxels()
-    rows = first.batch == 0
-    names = ("features", "colors", "grid", "batch", "confidence", "count", "centroid")
-    alone = Voxels(*(getattr(first, name)[rows] for name in names), first.voxel_size[:1])  # pyright: ignore[reportCallIssue]
-    torch.testing.assert_close(head(50)(alone).means, both.scene(0).means)
-
-
 def test_below_the_limit_nothing_changes(caplog: pytest.LogCaptureFixture) -> None:
     voxels = some_voxels()
     for limit in (120, 10**6):

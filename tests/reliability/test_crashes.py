@@ -82,16 +82,6 @@ def test_a_damaged_last_checkpoint_is_set_aside(tmp_path: Path, cache: Path, who
     assert "continuing from step-4.ckpt" in said
 
 
-def test_auto_does_not_start_over_where_all_checkpoints_are_damaged(tmp_path: Path, cache: Path) -> None:
-    folder = tmp_path / "run"
-    (folder / "checkpoints").mkdir(parents=True)
-    (folder / "checkpoints" / "step-2.ckpt").write_bytes(b"damaged")
-    attempt = harness.start(TRAIN, harness.training(folder, cache), folder)
-    assert attempt.wait() == 1
-    assert "FileNotFoundError: no valid checkpoint in" in attempt.said()
-    assert (folder / "checkpoints" / "step-2.ckpt").is_file()
-
-
 @pytest.mark.slow
 def test_twenty_kills(tmp_path: Path, cache: Path, whole: Path) -> None:
     kills: dict[str, int] = {}

@@ -16,7 +16,6 @@ from tests.reliability.degenerate import SCENES
 from tests.reliability.steps import TINY, first_batches, tiny_run
 from tests.training_helpers import SMALL
 from vg2gt.losses import EnhancementLoss, GaussianLoss, ScaleAlignment, VG2GTLoss
-from vg2gt.training.distributed import interleave
 from vg2gt.training.loop import Run
 from vg2gt.types import Batch
 
@@ -198,11 +197,6 @@ def test_an_error_of_one_rank_ends_both(two) -> None:
     assert not list(folder.glob("broken_loader-*.pt"))
     assert all(rank.returncode != 0 for rank in ended)
     assert "this batch cannot be read" in ended[1].stderr
-
-
-def test_what_ranks_hold_is_interleaved() -> None:
-    joined = interleave([{"a": 1, "c": 3, "e": 5}, {"b": 2, "d": 4}, {"a": 9}])
-    assert list(joined.items()) == [("a", 1), ("b", 2), ("c", 3), ("d", 4), ("e", 5)]
 
 
 # ------------------------------------------------------------------------------------------------------------- slow

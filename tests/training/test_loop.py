@@ -115,6 +115,11 @@ def test_a_run_never_restarts_silently(full_run: Path, cache: Path, tmp_path: Pa
         train(small_config(tmp_path, cache, "ckpt=last"))
     with pytest.raises(FileNotFoundError, match="nowhere"):
         train(small_config(tmp_path, cache, "ckpt=nowhere.ckpt"))
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints" / "step-2.ckpt").write_bytes(b"damaged")
+    with pytest.raises(FileNotFoundError, match="no valid checkpoint in"):
+        train(small_config(tmp_path, cache, "ckpt=auto"))
+    assert (tmp_path / "checkpoints" / "step-2.ckpt").read_bytes() == b"damaged"
 
 
 @pytest.fixture

@@ -7,10 +7,9 @@ draws and learning rate advance, so that a resumed run sees the same steps.
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from itertools import zip_longest
 from typing import Any, TypeVar
 
 import lightning
@@ -18,7 +17,6 @@ import torch
 import torch.distributed
 from torch import Tensor
 
-Key = TypeVar("Key")
 Value = TypeVar("Value")
 KEPT = 20  # maximum number of faults in the report of a run
 
@@ -37,16 +35,6 @@ def all_gather_object(value: Value) -> list[Value]:
     found: list[Any] = [None] * world_size()
     torch.distributed.all_gather_object(found, value)
     return found
-
-
-def interleave(parts: Sequence[Mapping[Key, Value]]) -> dict[Key, Value]:
-    """Merges the ranks' mappings in round-robin order; a repeated key keeps its first value."""
-    joined: dict[Key, Value] = {}
-    for row in zip_longest(*parts):
-        for key, part in zip(row, parts, strict=True):
-            if key is not None:
-                joined.setdefault(key, part[key])
-    return joined
 
 
 @contextmanager

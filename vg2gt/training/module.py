@@ -23,7 +23,7 @@ from vg2gt.model import VG2GT, Reconstructor
 from vg2gt.profiling import stage
 from vg2gt.rendering import Renderer, UnrenderableError
 from vg2gt.runs.checkpoints import MADE_OF, MODEL_PREFIX, model_state
-from vg2gt.training.distributed import Fault, SkippedSteps, all_gather_object, finite, interleave, world_size
+from vg2gt.training.distributed import Fault, SkippedSteps, all_gather_object, finite, world_size
 from vg2gt.training.schedule import cosine_with_warmup, parameter_groups
 from vg2gt.types import Batch, Prediction
 
@@ -106,7 +106,7 @@ class VG2GTModule(lightning.LightningModule):
         self._cause: str | None = None  # why the current step must be skipped
         self._scenes: tuple[str, ...] = ()
         self._figures: dict[str, Tensor] = {}
-        self._metrics: dict[tuple[str | int, ...], dict[str, float]] = {}
+        self._metrics: dict[tuple[str, tuple[int, ...]], dict[str, float]] = {}
         self.made_of: str | None = None  # configuration of the model's parts as YAML, stored in checkpoints
         self.strict_loading = (
             False  # weights of a frozen backbone are not stored; load_state_dict checks everything else
@@ -258,15 +258,16 @@ class VG2GTModule(lightning.LightningModule):
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """Evaluates a batch of scenes on their held-out views."""
         for index, scene in enumerate(batch.scene):
-            sample = (scene, *batch.frame_ids[index].tolist())
+            sample = (scene, tuple(batch.frame_ids[index].tolist()))
             self._metrics[sample] = evaluate_scene(
                 self.model, self.renderer, batch.single(index), self.rasterized_depth
             )
 
     def on_validation_epoch_end(self) -> None:
-        """Logs means over the scenes of all ranks, in the order of a single process, as ``eval/<name>``."""
-        for metrics in interleave(all_gather_object(self._metrics)).values():
-            for name, value in metrics.items():
+        """Logs means over the scenes of all ranks, in the same order on any number of them, as ``eval/<name>``."""
+        found = {sample: metrics for part in all_gather_object(self._metrics) for sample, metrics in part.items()}
+        for sample in sorted(found):
+            for name, value in found[sample].items():
                 if math.isfinite(value):  # a scene without ground-truth depth has no depth error
                     self.log(f"eval/{name}", value, on_epoch=True, batch_size=1)
 
