@@ -6,7 +6,6 @@ import csv
 import importlib
 import os
 import signal
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -17,7 +16,7 @@ from typing import Any
 
 import torch
 
-from tests.commands import ROOT, become, warm_process
+from tests.commands import become, warm_process
 from tests.training_helpers import SMALL
 from vg2gt.io.files import read_json
 from vg2gt.runs.checkpoints import read_checkpoint
@@ -55,12 +54,11 @@ class Attempt:
     output: Path
     process: Any
     before: set[tuple[str, int]]
-    seen: dict[str, Any] = field(default_factory=dict)
     started: float = field(default_factory=time.monotonic)
 
     def status(self) -> int | None:
         """Its exit status, None while it runs."""
-        return self.process.poll() if isinstance(self.process, subprocess.Popen) else self.process.exitcode
+        return self.process.exitcode
 
     def new(self) -> set[str]:
         """Names, relative to the folder, of all that this process has written."""
@@ -84,8 +82,6 @@ class Attempt:
 
     def wait(self) -> int:
         """Waits for the end; returns the exit status."""
-        if isinstance(self.process, subprocess.Popen):
-            return self.process.wait(PATIENCE)
         self.process.join(PATIENCE)
         return self.process.exitcode
 
@@ -101,15 +97,10 @@ class Attempt:
         raise TimeoutError(f"{self.folder} waited {PATIENCE:g} s:\n{self.said()[-3000:]}")
 
 
-def start(module: str, arguments: Sequence[str], folder: Path, warm: bool = True) -> Attempt:
+def start(module: str, arguments: Sequence[str], folder: Path) -> Attempt:
     """Starts a command in a new process group."""
     output, before = folder.with_name(f"{folder.name}.out"), _contents(folder)
-    if warm:
-        process = warm_process(_run_main, module, list(arguments), str(output), str(folder.parent))
-        return Attempt(folder, output, process, before)
-    command, environment = [sys.executable, "-m", module, *arguments], {**os.environ, "OMP_NUM_THREADS": "1"}
-    with open(output, "ab") as file:
-        process = subprocess.Popen(command, stdout=file, stderr=file, cwd=ROOT, start_new_session=True, env=environment)
+    process = warm_process(_run_main, module, list(arguments), str(output), str(folder.parent))
     return Attempt(folder, output, process, before)
 
 
@@ -119,27 +110,14 @@ def training(folder: Path, cache: Path, *overrides: str) -> list[str]:
     return [*fixed, *RUN, *overrides]
 
 
-def finish(module: str, arguments: Sequence[str], folder: Path, warm: bool = True) -> None:
+def finish(module: str, arguments: Sequence[str], folder: Path) -> None:
     """Lets a command run to its end."""
-    attempt = start(module, arguments, folder, warm)
+    attempt = start(module, arguments, folder)
     status = attempt.wait()
     assert status == 0, f"status {status}:\n{attempt.said()[-4000:]}"
 
 
 # ------------------------------------------------------------------------------------------------------- moments
-
-
-def after_seconds(seconds: float) -> Moment:
-    """Some time after the first row was logged: in a step, between steps, in an evaluation, while a file is written."""
-
-    def come(attempt: Attempt) -> bool:
-        if "since" not in attempt.seen:
-            if not attempt.log():
-                return False
-            attempt.seen["since"] = time.monotonic()
-        return time.monotonic() - attempt.seen["since"] >= seconds
-
-    return come
 
 
 def while_a_checkpoint_is_written(attempt: Attempt) -> bool:
@@ -189,14 +167,12 @@ def _contents(folder: Path) -> set[tuple[str, int]]:
 # ------------------------------------------------------------------------------------------------------- results
 
 
-def check_files(folder: Path) -> int:
-    """Reads every file that a killed run left under a final name; returns the number of checkpoints."""
-    checkpoints = sorted((folder / "checkpoints").glob("*.ckpt"))
-    for path in checkpoints:
+def check_files(folder: Path) -> None:
+    """Reads every file that a killed run left under a final name."""
+    for path in folder.glob("checkpoints/*.ckpt"):
         read_checkpoint(path)
     for path in folder.glob("*.json"):
         read_json(path)
-    return len(checkpoints)
 
 
 def assert_same(whole: Path, resumed: Path) -> None:

@@ -20,15 +20,6 @@ from vg2gt.types import Batch
 FULL = ("",)
 BASELINES = [("model=pixel_aligned",), ("model=voxel_merged",)]
 ABLATIONS = [(f"ablation={name}",) for name in ("wo_coarse", "rasterized", "wo_depth", "wo_enhance", "wo_split")]
-OPTIONS = [
-    ("model.scale.source=focal",),
-    ("model.scale.source=groundtruth",),
-    ("backend.background=1.2",),
-    ("model.gaussians.sh_degree=2",),
-    ("loss=paper",),
-    ("loss.align.source=rendered",),
-    ("loss.gaussian.normal_target=render",),
-]
 
 
 def make(overrides: tuple[str, ...], folder: Path, cache: Path, patch: pytest.MonkeyPatch) -> tuple[Run, Batch]:
@@ -39,7 +30,7 @@ def make(overrides: tuple[str, ...], folder: Path, cache: Path, patch: pytest.Mo
 
 
 TRAINED = [(1, FULL), (1, BASELINES[1])]
-TRAINED += [pytest.param(3, model, marks=pytest.mark.slow) for model in (FULL, *ABLATIONS, *BASELINES, *OPTIONS)]
+TRAINED += [pytest.param(3, model, marks=pytest.mark.slow) for model in (FULL, *ABLATIONS, *BASELINES)]
 
 
 @pytest.mark.parametrize(("times", "overrides"), TRAINED)
@@ -61,11 +52,8 @@ def evaluated(model: Reconstructor, renderer: Renderer, batch: Batch) -> dict[st
     return scores
 
 
-POINT_CLOUDS = [("model=pointcloud",), ("model=pointcloud", "model.spacing=neighbors")]
 EVALUATED = [FULL]
-EVALUATED += [
-    pytest.param(model, marks=pytest.mark.slow) for model in (*ABLATIONS, *BASELINES, *OPTIONS, *POINT_CLOUDS)
-]
+EVALUATED += [pytest.param(model, marks=pytest.mark.slow) for model in (*ABLATIONS, *BASELINES, ("model=pointcloud",))]
 
 
 @pytest.mark.parametrize("overrides", EVALUATED, ids=" ".join)
