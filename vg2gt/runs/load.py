@@ -285,13 +285,13 @@ def find_calibration(
         FileNotFoundError: if ``path`` does not exist.
         ValueError: if a file is damaged, or ``path`` was made for other weights.
     """
-    beside = calibration_path(weights.path) if weights.path is not None else None
-    if path is None and (beside is None or not beside.is_file()):
+    file = path if path is not None or weights.path is None else calibration_path(weights.path)
+    if file is None or (path is None and not Path(file).is_file()):
         return None
-    found = read_calibration(path or beside)
+    found = read_calibration(file)
     if found.made_for == made_for(model):
         return found
-    message = f"{path or beside} was made for other weights: recreate it with vg2gt calibrate"
+    message = f"{file} was made for other weights: recreate it with vg2gt calibrate"
     if path is not None:
         raise ValueError(message)
     log.warning("%s; depth error bounds are not available", message)
