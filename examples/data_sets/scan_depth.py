@@ -7,8 +7,10 @@ import io
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter
 
@@ -17,7 +19,6 @@ from vg2gt.data.sources.parsing import errors_name
 from vg2gt.io.arrays import load_npz
 from vg2gt.io.files import write_cached
 from vg2gt.io.image_files import Size
-from vg2gt.io.ply import read_point_ply
 
 _VERSION = 2  # part of the cache key; increment it when the result changes
 _CHUNK = 1 << 20  # points projected at a time
@@ -84,8 +85,12 @@ def read_points(path: Path, scene: str) -> NDArray[np.float32]:
     Raises:
         DataError: if the file is missing or damaged, or has no points.
     """
-    with errors_name(scene), np.errstate(over="ignore", invalid="ignore"):
-        points = read_point_ply(path).positions.astype(np.float32)
+    try:
+        with np.errstate(over="ignore", invalid="ignore"):
+            scan: Any = trimesh.load(path, file_type="ply", process=False)
+            points = np.asarray(scan.vertices).astype(np.float32)
+    except Exception as error:  # damaged files raise various errors
+        raise DataError(f"cannot read the scan {path} of scene {scene}: {error}") from error
     points = points[np.isfinite(points).all(1)]
     if not len(points):
         raise DataError(f"the scan {path} of scene {scene} has no points")

@@ -57,8 +57,8 @@ def test_written_scene_renders_to_the_image_in_memory(scene: Scene, tmp_path: Pa
 
 
 def test_path_between_cameras_of_mixed_sizes(scene: Scene, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    scene.save(tmp_path, ["scene.splat", "cameras.json"])
-    arguments = [str(tmp_path / "scene.splat"), "--cameras", str(tmp_path / "cameras.json"), "--quiet"]
+    scene.save(tmp_path, ["scene.spz", "cameras.json"])
+    arguments = [str(tmp_path / "scene.spz"), "--cameras", str(tmp_path / "cameras.json"), "--quiet"]
     render_command.main([*arguments, "--out", str(tmp_path / "path"), "--interpolate", "2"])
     assert len(list((tmp_path / "path" / "color").iterdir())) == 10
     assert (tmp_path / "path" / "color" / "008-002.png").is_file()

@@ -10,15 +10,15 @@ from PIL import Image
 from tests.io.gaussian_scenes import scene, views
 from tests.viewer.reading import read_viewer_html
 from vg2gt.cli import view
-from vg2gt.io import named_cameras, write_cameras_json, write_gaussian_ply, write_splat
+from vg2gt.io import named_cameras, write_cameras_json, write_gaussian_ply, write_spz
 from vg2gt.viewer import server
 
 
 @pytest.fixture
 def files(tmp_path: Path) -> Path:
-    """A folder with scene.ply, scene.splat, cameras.json and two of its three images."""
+    """A folder with scene.ply, scene.spz, cameras.json and two of its three images."""
     write_gaussian_ply(tmp_path / "scene.ply", scene(60))
-    write_splat(tmp_path / "scene.splat", scene(60))
+    write_spz(tmp_path / "scene.spz", scene(60))
     write_cameras_json(tmp_path / "cameras.json", named_cameras(views(), ["0.png", "1.png", "2.png"]))
     for index in range(2):
         Image.fromarray(np.full((40, 56, 3), 100, np.uint8)).save(tmp_path / f"{index}.png")
@@ -29,7 +29,7 @@ def run(*arguments: Path | str) -> None:
     view.main([*map(str, arguments)])
 
 
-@pytest.mark.parametrize("name", ["scene.ply", "scene.splat"])
+@pytest.mark.parametrize("name", ["scene.ply", "scene.spz"])
 def test_page_of_a_file(files: Path, capsys: pytest.CaptureFixture, name: str) -> None:
     run(files / name, "--cameras", files / "cameras.json", "--html", files / "out" / "page.html")
     assert len(read_viewer_html(files / "out" / "page.html")) == 60

@@ -18,7 +18,7 @@ def parser() -> argparse.ArgumentParser:
     """The command's arguments."""
     arguments = flag_parser("render", COMMANDS["render"], listing(OUTPUTS))
     add = arguments.add_argument
-    add("scene", help="scene.ply, .spz, .splat or .glb")
+    add("scene", help="scene.ply or .spz")
     add(
         "--cameras",
         required=True,

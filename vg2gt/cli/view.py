@@ -55,7 +55,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = flag_parser("view", COMMANDS["view"])
     add = parser.add_argument
-    add("scene", type=Path, help="scene.ply, .spz, .splat or .glb")
+    add("scene", type=Path, help="scene.ply or .spz")
     add("--cameras", type=Path, help="cameras, the first is the initial view; default: cameras.json next to the scene")
     add(
         "--images",

@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vg2gt.io.errors import FormatError
 from vg2gt.io.files import by_number, regular
+from vg2gt.io.points import checked_points
 from vg2gt.types import Cameras
 
 # Types of pycolmap, which is imported only where it is needed.
@@ -193,12 +194,7 @@ def colmap_from_views(
             f"expected one scene with as many views as names ({len(names)}), got cameras of shape "
             f"{list(poses.shape[:2])}; use Cameras.scene"
         )
-    xyz = np.zeros((0, 3)) if positions is None else np.asarray(positions, np.float64)
-    rgb = np.full(xyz.shape, 128, np.uint8) if colors is None else np.asarray(colors)
-    if xyz.ndim != 2 or xyz.shape[1] != 3 or rgb.shape != xyz.shape or rgb.dtype != np.uint8:
-        raise ValueError(
-            f"positions must be [N, 3] and colors uint8 [N, 3], got {list(xyz.shape)} and {rgb.dtype} {list(rgb.shape)}"
-        )
+    xyz, rgb = checked_points(np.zeros((0, 3)) if positions is None else positions, colors)
     owner, view_of, pixels = _observations(sources, len(xyz), len(names))
     tracks = [pycolmap.Track() for _ in xyz]
     model = pycolmap.Reconstruction()

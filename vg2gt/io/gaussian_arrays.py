@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +17,6 @@ log = logging.getLogger(__name__)
 MIN_SCALE = 1e-10  # smaller standard deviations overflow the renderers' inverse covariance
 OPACITY_MARGIN = 2.0**-24  # opacities are clipped to [this, 1 - this], so that their logits are finite
 _FLOAT_MAX = float(np.finfo(np.float32).max)
-_UPRIGHT = np.array([1.0, -1, -1])  # rotation by 180 degrees about x, of positions ...
-_UPRIGHT_SH = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1])  # ... and of spherical harmonics
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,23 +53,6 @@ def to_arrays(gaussians: Gaussians) -> GaussianArrays:
     if arrays["sh"].ndim != 3 or arrays["sh"].shape[1] not in (1, 4, 9, 16):
         raise ValueError(f"sh must be [G, 1, 4, 9 or 16, 3], got {list(arrays['sh'].shape)}")
     return GaussianArrays(**arrays)
-
-
-def upright(arrays: GaussianArrays) -> GaussianArrays:
-    """Rotates by 180 degrees about x: from our axes (y down, z forward) to OpenGL's (y up, z backward), or back."""
-    turned = arrays.sh * _UPRIGHT_SH[: arrays.sh.shape[1], None]
-    quats = arrays.quats * np.array([1.0, *_UPRIGHT])
-    return replace(arrays, means=arrays.means * _UPRIGHT, quats=quats, sh=turned)
-
-
-def spatial_order(means: NDArray[np.floating]) -> NDArray[np.int64]:
-    """Returns the Morton order ``[N]`` of positions, from their ranks on each axis; keeps neighbours close."""
-    cells = np.argsort(np.argsort(means, axis=0, kind="stable"), axis=0) * 1024 // max(len(means), 1)
-    code = np.zeros(len(means), np.int64)
-    for bit in range(10):
-        for axis in range(3):
-            code |= (cells[:, axis] >> bit & 1) << (3 * bit + axis)
-    return np.argsort(code, kind="stable")
 
 
 def smallest_three(quats: NDArray[np.floating]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

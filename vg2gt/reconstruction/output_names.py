@@ -14,10 +14,7 @@ MAPS = {
 
 OUTPUTS = {
     "scene.ply": "the Gaussians, as 3D Gaussian Splatting writes them, with error and support",
-    "scene.splat": "the same, 32 bytes each, for web viewers; no colour that depends on the view",
     "scene.spz": "the same, about 16 bytes each (Niantic's SPZ, version 3)",
-    "scene.compressed.ply": "the same, about 16 bytes each, as SuperSplat compresses them",
-    "scene.glb": "the same as glTF, KHR_gaussian_splatting",
     "tiles": "the same split into regions, SPZ files and index.json in tiles/; default above a million Gaussians",
     "cameras.json": "the cameras of the views",
     "points.ply": "coloured points of the decoded depth",

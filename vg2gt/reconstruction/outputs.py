@@ -23,15 +23,15 @@ from vg2gt.io import (
     write_cameras_json,
     write_colmap,
     write_gaussian_ply,
-    write_gaussians,
     write_glb,
     write_mesh,
     write_point_ply,
+    write_spz,
+    write_tiles,
     write_transforms,
 )
 from vg2gt.io.files import write_bytes, write_json
 from vg2gt.io.images import to_pixels, write_png
-from vg2gt.io.tiles import write_tiles
 from vg2gt.io.video import require_pyav
 from vg2gt.reconstruction.camera_paths import orbit
 from vg2gt.reconstruction.export import exported_views
@@ -310,12 +310,9 @@ def _target(output: str) -> str:
 
 
 _WRITERS: dict[str, Callable[[Scene, Path], Any]] = {
-    **dict.fromkeys(
-        (name for name in OUTPUTS if name.startswith("scene.")),
-        lambda scene, path: write_gaussians(path, scene.gaussians),
-    ),
-    "tiles": _tiles,
     "scene.ply": _scene_ply,
+    "scene.spz": lambda scene, path: write_spz(path, scene.gaussians),
+    "tiles": _tiles,
     "cameras.json": lambda scene, path: write_cameras_json(path, scene.named_cameras()),
     "points.ply": _points_ply,
     "views.npz": _views,

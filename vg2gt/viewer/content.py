@@ -13,8 +13,8 @@ from PIL import Image, ImageOps
 
 from vg2gt.io.arrays import npz_names, read_npz
 from vg2gt.io.cameras_json import NamedCamera, invert_pose
-from vg2gt.io.glb import scene_extent
 from vg2gt.io.images import color_image, open_image
+from vg2gt.io.points import scene_extent
 from vg2gt.types import Gaussians
 
 FRUSTUM_SHARE = 0.02  # depth of a drawn frustum, relative to the scene's extent

@@ -11,7 +11,7 @@ from examples.data_sets.scan_depth import render_points
 from examples.data_sets.tanks_and_temples import TanksAndTemples
 from vg2gt.data import DataError
 from vg2gt.geometry.cameras import unproject
-from vg2gt.io.ply import write_point_ply
+from vg2gt.io import write_point_ply
 
 from .layout_dtu import write_test
 from .layout_tanks_and_temples import write as write_tanks

@@ -1,6 +1,6 @@
-"""GLB (binary glTF 2.0): points and camera frusta for any 3D viewer.
+"""Coloured points: PLY, and GLB (binary glTF 2.0) with camera frusta for any 3D viewer.
 
-glTF has y up and cameras looking along -z; our world is OpenCV's (y down, z forward). The file's root rotates the scene
+glTF has y up and cameras looking along -z; our world is OpenCV's (y down, z forward). The GLB's root rotates the scene
 by 180 degrees about x, so that it is upright. Colours are written unchanged, as sRGB.
 """
 
@@ -17,51 +17,70 @@ from vg2gt.io.files import write_bytes
 from vg2gt.types import Cameras
 
 TO_GLTF = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV world to glTF world
-POINTS, FRUSTA = "points", "cameras"  # names of the two objects in the file
-_FRUSTUM_SHARE = 0.05  # default depth of a frustum, relative to the scene's extent
+POINTS, FRUSTA = "points", "cameras"  # names of the two objects in a GLB
+_FRUSTUM_SHARE = 0.05  # depth of a frustum, relative to the scene's extent
 _MIDDLE = 0.9  # share of the points that defines the extent; far outliers would enlarge the frusta
 # apex to the four corners, border of the image, and a mark above its upper edge
 _EDGES = ((0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1), (1, 5), (5, 2))
 
 
-def write_glb(
-    path: str | Path,
-    positions: ArrayLike,
-    colors: ArrayLike | None = None,
-    cameras: Cameras | None = None,
-    frustum_depth: float | None = None,
-) -> Path:
+def checked_points(positions: ArrayLike, colors: ArrayLike | None) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Returns positions ``[N, 3]`` and colours ``[N, 3]`` as arrays; no colours are mid grey.
+
+    Raises:
+        ValueError: if shapes or types are wrong, or a position is not finite.
+    """
+    xyz = np.asarray(positions, np.float64)
+    rgb = np.full(xyz.shape, 128, np.uint8) if colors is None else np.asarray(colors)
+    if xyz.ndim != 2 or xyz.shape[1] != 3 or rgb.shape != xyz.shape or rgb.dtype != np.uint8:
+        raise ValueError(
+            f"positions must be [N, 3] and colors uint8 [N, 3], got {list(xyz.shape)} and {rgb.dtype} {list(rgb.shape)}"
+        )
+    if not np.isfinite(xyz).all():
+        raise ValueError("positions must be finite")
+    return xyz, rgb
+
+
+def write_point_ply(path: str | Path, positions: ArrayLike, colors: ArrayLike | None = None) -> Path:
+    """Writes points as binary PLY, float32 ``x y z`` and uchar ``red green blue alpha``, atomically.
+
+    Args:
+        path: the file.
+        positions: ``[N, 3]``.
+        colors: ``[N, 3]`` uint8; None: mid grey.
+
+    Raises:
+        ValueError: if shapes or types are wrong, or a position is not finite.
+    """
+    import trimesh  # imported here, because it takes a second
+
+    content = trimesh.PointCloud(*checked_points(positions, colors)).export(file_type="ply")
+    assert isinstance(content, bytes)
+    return write_bytes(path, content)
+
+
+def write_glb(path: str | Path, positions: ArrayLike, colors: ArrayLike | None, cameras: Cameras) -> Path:
     """Writes points and camera frusta, atomically.
 
     Args:
         path: the file.
         positions: ``[N, 3]`` world positions, stored as float32.
         colors: ``[N, 3]`` uint8; None: mid grey.
-        cameras: one scene (B = 1); None: points only.
-        frustum_depth: distance from a camera's centre to its drawn image, in scene units; None: 1/20 of the extent of
-            points and cameras.
+        cameras: one scene (B = 1). The frusta's depth is 1/20 of the extent of points and cameras.
 
     Raises:
-        ValueError: if shapes or types are wrong, a value is not finite, or there is nothing to write.
+        ValueError: if shapes or types are wrong, or a position is not finite.
     """
-    import trimesh  # imported here, because it takes a second
+    import trimesh
 
-    xyz = np.asarray(positions, np.float64)
-    rgb = np.full(xyz.shape, 128, np.uint8) if colors is None else np.asarray(colors)
-    if xyz.ndim != 2 or xyz.shape[1] != 3 or not np.isfinite(xyz).all():
-        raise ValueError(f"positions must be finite [N, 3], got {list(xyz.shape)}")
-    if rgb.shape != xyz.shape or rgb.dtype != np.uint8:
-        raise ValueError(f"colors must be uint8 {list(xyz.shape)} like positions, got {rgb.dtype} {list(rgb.shape)}")
-    if not len(xyz) and cameras is None:
-        raise ValueError("there are neither points nor cameras to write")
+    xyz, rgb = checked_points(positions, colors)
     scene = trimesh.Scene()
     if len(xyz):
         scene.add_geometry(trimesh.PointCloud(xyz, rgb), geom_name=POINTS, node_name=POINTS)
-    if cameras is not None:
-        centers = invert_rigid(cameras.world_to_camera.detach().cpu().double())[0, :, :3, 3].numpy()
-        corners = frusta(cameras, frustum_depth or _FRUSTUM_SHARE * scene_extent(xyz, centers))
-        lines = corners[:, np.array(_EDGES)].reshape(-1, 2, 3)
-        scene.add_geometry(trimesh.load_path(lines), geom_name=FRUSTA, node_name=FRUSTA)
+    centers = invert_rigid(cameras.world_to_camera.detach().cpu().double())[0, :, :3, 3].numpy()
+    corners = frusta(cameras, _FRUSTUM_SHARE * scene_extent(xyz, centers))
+    lines = corners[:, np.array(_EDGES)].reshape(-1, 2, 3)
+    scene.add_geometry(trimesh.load_path(lines), geom_name=FRUSTA, node_name=FRUSTA)
     scene.apply_transform(TO_GLTF)
     content = scene.export(file_type="glb")
     assert isinstance(content, bytes)
@@ -78,12 +97,7 @@ def frusta(cameras: Cameras, depth: float) -> NDArray[np.float64]:
     Returns:
         Per view the centre, the outer corners of the image clockwise from the upper left, and a point above its upper
         edge that shows which way is up.
-
-    Raises:
-        ValueError: if there is more than one scene.
     """
-    if len(cameras.world_to_camera) != 1:
-        raise ValueError(f"expected cameras of one scene, got {len(cameras.world_to_camera)}; use Cameras.scene")
     height, width = cameras.size
     left, top, right, bottom = -0.5, -0.5, width - 0.5, height - 0.5  # the image's edges, not its outer pixel centres
     above = (left + right) / 2, top - 0.25 * height
