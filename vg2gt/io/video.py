@@ -1,7 +1,7 @@
 """Frames of videos, and animations of rendered views.
 
-GIF uses Pillow and always works. All other formats use PyAV (FFmpeg's libraries), which the extra ``video`` installs
-(``pip install vg2gt[video]``).
+PyAV (FFmpeg's libraries) reads all formats and writes MP4; the extra ``video`` installs it (``pip install
+vg2gt[video]``). Pillow writes GIF.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from PIL import Image
 
 from vg2gt.io.errors import FormatError
 from vg2gt.io.files import replacing, write_bytes
-from vg2gt.io.images import open_image
 
 if TYPE_CHECKING:
     from av import VideoFrame  # optional
@@ -32,11 +31,7 @@ _QUALITY = "18"  # constant rate factor of H.264: 0 is lossless, 23 is x264's de
 _PALETTE = 255
 # Containers that hold all their frames. FFmpeg detects formats by content: a playlist under any name would make it open
 # other files of this machine.
-_CONTAINERS = "mov,matroska,avi,mpegts,mpeg,flv,asf,ogg"
-
-
-class MissingDecoderError(ImportError):
-    """PyAV is not installed; the message says how to install it."""
+_CONTAINERS = "mov,matroska,avi,mpegts,mpeg,flv,asf,ogg,gif"
 
 
 def count_frames(path: str | Path) -> int:
@@ -44,12 +39,8 @@ def count_frames(path: str | Path) -> int:
 
     Raises:
         FormatError: if the file cannot be read.
-        MissingDecoderError: if it is not a GIF and PyAV is not installed.
+        ImportError: if PyAV is not installed.
     """
-    path = _existing(path)
-    if path.suffix.lower() == ".gif":
-        with _open_gif(path) as image:
-            return getattr(image, "n_frames", 1)
     with _opened(path) as container:
         return sum(packet.size > 0 for packet in container.demux(video=0))  # the last packet is empty
 
@@ -66,12 +57,8 @@ def read_video(path: str | Path, every: int = 1) -> Iterator[tuple[int, NDArray[
 
     Raises:
         FormatError: if the file cannot be read.
-        MissingDecoderError: if it is not a GIF and PyAV is not installed.
+        ImportError: if PyAV is not installed.
     """
-    path = _existing(path)
-    if path.suffix.lower() == ".gif":
-        yield from _read_gif(path, every)
-        return
     number = -1
     with _opened(path) as container:
         for number, frame in enumerate(_decoded(container)):
@@ -110,10 +97,9 @@ def read_frame(path: str | Path, number: int) -> NDArray[np.uint8]:
 
     Raises:
         FormatError: if the file cannot be read or has no such frame.
-        MissingDecoderError: if PyAV is not installed.
+        ImportError: if PyAV is not installed.
     """
-    path = _existing(path)
-    times = _frame_times(path, path.stat().st_mtime_ns)
+    times = _frame_times(path, Path(path).stat().st_mtime_ns)
     if not 0 <= number < len(times):
         raise FormatError(f"{path} has {len(times)} frames, but frame {number} was requested")
     with _opened(path) as container:
@@ -129,14 +115,14 @@ def video_size(path: str | Path) -> tuple[int, int]:
 
     Raises:
         FormatError: if the file cannot be read.
-        MissingDecoderError: if PyAV is not installed.
+        ImportError: if PyAV is not installed.
     """
     height, width = read_frame(path, 0).shape[:2]
     return height, width
 
 
 @lru_cache(maxsize=8)
-def _frame_times(path: Path, state: int) -> list[int]:
+def _frame_times(path: str | Path, state: int) -> list[int]:
     """Sorted presentation times of all frames; a new ``state`` invalidates the cache when the file changes."""
     with _opened(path) as container:
         return sorted(packet.pts for packet in container.demux(video=0) if packet.size and packet.pts is not None)
@@ -153,7 +139,7 @@ def write_video(path: str | Path, frames: Sequence[NDArray[np.uint8]], fps: floa
 
     Raises:
         ValueError: if there are no frames, sizes differ, ``fps`` is not positive, or the suffix is unknown.
-        MissingDecoderError: if it is an MP4 and PyAV is not installed.
+        ImportError: if it is an MP4 and PyAV is not installed.
     """
     path = Path(path)
     if not len(frames) or any(f.shape != frames[0].shape or f.dtype != np.uint8 for f in frames):
@@ -167,32 +153,22 @@ def write_video(path: str | Path, frames: Sequence[NDArray[np.uint8]], fps: floa
     return _write_mp4(path, frames, fps)
 
 
-def has_pyav() -> bool:
-    """Whether PyAV is installed, which all formats except GIF need."""
-    return importlib.util.find_spec("av") is not None
-
-
 def require_pyav(purpose: str) -> None:
     """Checks early that PyAV is installed.
 
     Raises:
-        MissingDecoderError: if it is not, naming the purpose and the remedy.
+        ImportError: if it is not, naming the purpose and the remedy.
     """
-    if not has_pyav():
-        raise MissingDecoderError(f"{purpose} needs PyAV: pip install 'vg2gt[video]' (GIF works without)")
-
-
-def _existing(path: str | Path) -> Path:
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"no video at {path}")
-    return path
+    if importlib.util.find_spec("av") is None:
+        raise ImportError(f"{purpose} needs PyAV: pip install 'vg2gt[video]'")
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[InputContainer]:
+def _opened(path: str | Path) -> Iterator[InputContainer]:
     """Opens a video file, but no other files that it refers to."""
-    require_pyav("a video other than GIF")
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"no video at {path}")
+    require_pyav(f"reading {path}")
     import av
     from av.error import FFmpegError
 
@@ -229,23 +205,6 @@ def _upright(frame: VideoFrame) -> NDArray[np.uint8]:
     if abs(b) > abs(a):
         pixels, a, d = pixels.swapaxes(0, 1), c, b
     return np.ascontiguousarray(pixels[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1])
-
-
-def _open_gif(path: Path) -> Image.Image:
-    try:
-        return open_image(path)
-    except Exception as error:  # Pillow raises various errors on damaged files
-        raise FormatError(f"{path}: not a GIF ({error})") from error
-
-
-def _read_gif(path: Path, every: int) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-    with _open_gif(path) as image:
-        for number in range(0, getattr(image, "n_frames", 1), every):
-            try:
-                image.seek(number)
-                yield number, np.array(image.convert("RGB"))
-            except Exception as error:  # Pillow raises various errors on damaged files
-                raise FormatError(f"{path}: frame {number} is damaged ({error})") from error
 
 
 def _gif(frames: Sequence[NDArray[np.uint8]], fps: float) -> bytes:

@@ -94,7 +94,7 @@ def animation(path: Path, fps: float) -> Iterator[AddView]:
     """Collects the colour of the views and writes an animation, ``.gif`` or ``.mp4``, at ``fps`` frames per second.
 
     Raises:
-        MissingDecoderError: if it is not a GIF and PyAV is not installed.
+        ImportError: if it is not a GIF and PyAV is not installed.
     """
     frames: list[NDArray[np.uint8]] = []
     yield lambda view: frames.append(to_pixels(view.color))

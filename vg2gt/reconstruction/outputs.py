@@ -123,7 +123,7 @@ def write_outputs(
     Raises:
         FileExistsError: if an output exists and ``overwrite`` is false.
         PermissionError: if the folder cannot be written to.
-        MissingDecoderError: if an animation needs PyAV and it is not installed.
+        ImportError: if an animation needs PyAV and it is not installed.
         ValueError: if an output is unknown.
     """
     check_outputs(outputs)

@@ -128,8 +128,7 @@ def check_pictures(images: ImagesLike, skip_damaged: bool = False) -> None:
         if path is None:
             continue
         if _is_video(path):
-            if path.suffix.lower() != ".gif":
-                require_pyav(f"reading {path}")
+            require_pyav(f"reading {path}")
         elif path.is_file():
             _pictures(path, 1, 1, damaged)
         elif not any(file.suffix.lower() in _HOLDS_PICTURES for file in path.rglob("*")):
@@ -354,7 +353,7 @@ def _video(path: Path, every: int, max_images: int | None) -> list[Picture]:
     count = count_frames(path)
     if limit is not None:
         every = max(every, math.ceil(count / limit))
-    if count > IN_MEMORY * every and path.suffix.lower() != ".gif":
+    if count > IN_MEMORY * every:
         size, frames = video_size(path), VideoFrames(path, every)
         return [_frame_of_video(frames, f"{path.stem}-{n:06d}", n, size) for n in range(0, count, every)]
     return [_in_memory(f"{path.stem}-{number:06d}", pixels) for number, pixels in read_video(path, every)]
