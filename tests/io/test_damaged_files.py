@@ -8,7 +8,7 @@ import pytest
 from tests.io.gaussian_scenes import scene
 from tests.io.mutations import survives
 from tests.io.test_cameras_json import mixed
-from tests.io.test_colmap import small_model
+from tests.io.test_colmap import small_model, write
 from tests.io.test_nerfstudio import random_transforms
 from vg2gt import io
 from vg2gt.io.colmap import FILES
@@ -20,7 +20,7 @@ CASES: dict[str, tuple[Callable[[Path], object], Callable[[Path], object]]] = {
     "cameras.json": (lambda path: io.write_cameras_json(path, mixed()), io.read_cameras_json),
     **{
         f"{name}{suffix}": (
-            lambda path: io.write_colmap(path.parent, small_model(points=20), text=path.suffix == ".txt"),
+            lambda path: write(path.parent, small_model(points=20), text=path.suffix == ".txt"),
             lambda path: io.read_colmap(path.parent),
         )
         for name in FILES
@@ -32,7 +32,7 @@ CASES: dict[str, tuple[Callable[[Path], object], Callable[[Path], object]]] = {
 @pytest.mark.parametrize("count", [60, pytest.param(600, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", CASES)
 def test_damaged_files_are_refused_or_read(tmp_path: Path, name: str, count: int) -> None:
-    write, read = CASES[name]
+    make, read = CASES[name]
     path = tmp_path / name
-    write(path)
+    make(path)
     assert survives(lambda: read(path), path, count) > count / 4

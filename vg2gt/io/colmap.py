@@ -104,24 +104,17 @@ def read_colmap(folder: str | Path) -> Reconstruction:
     return model
 
 
-def write_colmap(folder: str | Path, model: Reconstruction, *, text: bool = False) -> Path:
-    """Writes a model, each file atomically.
+def write_colmap(folder: str | Path, model: Reconstruction) -> Path:
+    """Writes a model as ``.bin``, each file atomically.
 
     Args:
-        folder: output folder, created if needed. Files of the other kind, which may be read instead, are refused.
+        folder: output folder, created if needed.
         model: model to write; not changed.
-        text: True writes ``.txt``, False ``.bin``.
-
-    Raises:
-        FileExistsError: if the folder holds a model of the other kind.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    other = colmap_files(folder).get("cameras")
-    if other is not None and (other.suffix.lower() == ".txt") != text:
-        raise FileExistsError(f"{folder} holds {other.name} of another model; write to an empty folder")
     with tempfile.TemporaryDirectory(prefix=".colmap-", dir=folder) as temporary, quiet_colmap():
-        (model.write_text if text else model.write_binary)(temporary)
+        model.write_binary(temporary)
         for path in sorted(Path(temporary).iterdir()):
             os.replace(path, folder / path.name)
     return folder

@@ -48,38 +48,13 @@ def to_arrays(gaussians: Gaussians) -> GaussianArrays:
             raise ValueError(f"{name} has {np.sum(~np.isfinite(values))} values that are not finite; leave them out")
     if (arrays["scales"] <= 0).any():
         raise ValueError(f"scales must be positive standard deviations, the smallest is {arrays['scales'].min()}")
+    if not arrays["quats"].any(-1).all():
+        raise ValueError("quats must have nonzero norm")
     if ((arrays["opacities"] < 0) | (arrays["opacities"] > 1)).any():
         raise ValueError("opacities must be in [0, 1] (not logits)")
     if arrays["sh"].ndim != 3 or arrays["sh"].shape[1] not in (1, 4, 9, 16):
         raise ValueError(f"sh must be [G, 1, 4, 9 or 16, 3], got {list(arrays['sh'].shape)}")
     return GaussianArrays(**arrays)
-
-
-def smallest_three(quats: NDArray[np.floating]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Encodes the rotations of quaternions by their three smallest components.
-
-    Returns:
-        The index ``[N]`` of the largest component, and the other three ``[N, 3]`` of the unit quaternion whose largest
-        component is positive.
-
-    Raises:
-        ValueError: if a quaternion is zero.
-    """
-    length = np.linalg.norm(quats, axis=-1, keepdims=True)
-    if (length == 0).any():
-        raise ValueError("quats must have nonzero norm")
-    place = np.abs(quats).argmax(1)[:, None]
-    unit = quats / (length * np.sign(np.take_along_axis(quats, place, 1)))
-    return place[:, 0], unit[np.arange(4) != place].reshape(-1, 3)
-
-
-def from_smallest_three(place: NDArray[np.integer], others: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Decodes unit quaternions ``[N, 4]``, the inverse of :func:`smallest_three`."""
-    largest = np.arange(4) == place[:, None]
-    quats = np.empty(largest.shape)
-    quats[~largest] = others.ravel()
-    quats[largest] = np.sqrt(np.maximum(1 - (others**2).sum(1), 0))
-    return quats
 
 
 def to_gaussians(path: Path, arrays: GaussianArrays) -> Gaussians:

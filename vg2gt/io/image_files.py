@@ -53,9 +53,8 @@ def image_size(path: Path, scene: str, upright: bool = False, content: bytes | N
         upright: size after turning a photograph upright by its EXIF orientation.
         content: the encoded image if it is a part of the file; None: the whole file.
     """
-    with _opened(path if content is None else io.BytesIO(content), path, scene) as image:
-        turned = upright and _orientation(image) in _QUARTER_TURNS
-        return (image.width, image.height) if turned else (image.height, image.width)
+    with _opened(path, scene, content) as image:
+        return _size(image, upright)
 
 
 def focal_length(path: Path, size: Size) -> float | None:
@@ -103,14 +102,11 @@ def read_color(
         content: the encoded image if it is a part of the file; None: the whole file.
         upright: turn a photograph upright by its EXIF orientation.
     """
-    with _opened(path if content is None else io.BytesIO(content), path, scene) as image:
-        turned = upright and _orientation(image) in _QUARTER_TURNS
-        check_size(path, scene, image.size if turned else image.size[::-1], size)  # before anything is decoded
+    with _opened(path, scene, content) as image:
+        check_size(path, scene, _size(image, upright), size)  # before anything is decoded
         turn = _TURNS.get(_orientation(image)) if upright else None
-        pixels = np.array(color_image(image))
-        if turn is not None:
-            pixels = np.array(Image.fromarray(pixels).transpose(turn))
-    return pixels
+        picture = color_image(image)
+        return np.array(picture if turn is None else picture.transpose(turn))
 
 
 def read_mask(
@@ -128,7 +124,7 @@ def read_mask(
     Returns:
         The mask; None if all pixels count, as in a photograph without transparency.
     """
-    with _opened(path if content is None else io.BytesIO(content), path, scene) as image:
+    with _opened(path, scene, content) as image:
         grey = not has_alpha(image)
         if grey and not is_mask:
             return None
@@ -153,7 +149,7 @@ def read_mask_file(path: Path, scene: str, photo: Path | None = None) -> NDArray
     mask = read_mask(path, scene, upright=photo is not None, is_mask=True)
     if mask is None or photo is None:
         return mask
-    with _opened(photo, photo, scene) as image:
+    with _opened(photo, scene) as image:
         turn, (width, height) = _orientation(image), image.size
     stored = abs(mask.shape[0] * width / (mask.shape[1] * height) - 1) < _SAME_SHAPE
     upright = abs(mask.shape[0] * height / (mask.shape[1] * width) - 1) < _SAME_SHAPE
@@ -164,13 +160,13 @@ def read_mask_file(path: Path, scene: str, photo: Path | None = None) -> NDArray
 
 def orientation(path: Path, scene: str) -> int:
     """Returns the EXIF orientation of an image; 1 (upright) if it has none."""
-    with _opened(path, path, scene) as image:
+    with _opened(path, scene) as image:
         return _orientation(image)
 
 
 def read_depth(path: Path, scene: str, size: Size | None = None) -> NDArray[np.int64]:
     """Reads a one-channel integer depth image ``[H, W]`` as stored (16-bit PNG, PGM or TIFF)."""
-    with _opened(path, path, scene) as image:
+    with _opened(path, scene) as image:
         channels = len(image.getbands())
         if channels == 1:
             check_size(path, scene, image.size[::-1], size)
@@ -193,16 +189,21 @@ def check_size(path: Path, scene: str, found: tuple[int, ...], expected: Size | 
 
 
 @contextmanager
-def _opened(file: Path | io.BytesIO, path: Path, scene: str) -> Iterator[Image.Image]:
+def _opened(path: Path, scene: str, content: bytes | None = None) -> Iterator[Image.Image]:
     """Opens an image; errors while it is read become ``DataError`` with the file, the scene and a remedy."""
     try:
-        with open_image(file) as image:
+        with open_image(path if content is None else io.BytesIO(content)) as image:
             yield image
     except DataError:
         raise
     except _DAMAGED as error:
         whose, remedy = (f" of scene {scene}", "remove the frame") if scene else ("", "leave it out")
         raise DataError(f"cannot read {path}{whose}: {error}; restore the file or {remedy}") from error
+
+
+def _size(image: Image.Image, upright: bool) -> Size:
+    turned = upright and _orientation(image) in _QUARTER_TURNS
+    return (image.width, image.height) if turned else (image.height, image.width)
 
 
 def _orientation(image: Image.Image) -> int:

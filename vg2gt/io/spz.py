@@ -23,13 +23,7 @@ from numpy.typing import NDArray
 
 from vg2gt.io.errors import FormatError
 from vg2gt.io.files import regular, write_bytes
-from vg2gt.io.gaussian_arrays import (
-    GaussianArrays,
-    from_smallest_three,
-    smallest_three,
-    to_arrays,
-    to_gaussians,
-)
+from vg2gt.io.gaussian_arrays import GaussianArrays, to_arrays, to_gaussians
 from vg2gt.types import Gaussians
 
 _HEADER = struct.Struct("<4sIIBBBB")
@@ -53,18 +47,12 @@ def write_spz(path: str | Path, gaussians: Gaussians) -> Path:
             f"positions reach {extent:.3g} units, but .spz holds at most 8 million: write a PLY, or scale the scene"
         )
     fixed = np.rint(arrays.means * 2.0**bits).astype("<i4")
-    place, others = smallest_three(np.roll(arrays.quats, -1, 1))
-    rotation = place.astype("<u4")
-    for column in others.T:
-        rotation = (
-            rotation << 10 | (column < 0).astype("<u4") << 9 | np.rint(abs(column) * np.sqrt(2) * 511).astype("<u4")
-        )
     columns = (
         fixed[:, :, None].view("u1")[:, :, :3],
         _bytes(arrays.opacities * 255),
         _bytes((arrays.sh[:, 0] * _COLOR + 0.5) * 255),
         _bytes((np.log(arrays.scales) + 10) * 16),
-        rotation,
+        _packed(np.roll(arrays.quats, -1, 1)),
         _bytes(arrays.sh[:, 1:] * 128 + 128),
     )
     head = _HEADER.pack(_MAGIC, 3, len(fixed), _DEGREES[arrays.sh.shape[1]], bits, 0, 0)
@@ -113,7 +101,7 @@ def read_spz(path: str | Path) -> Gaussians:
     )
     arrays = GaussianArrays(
         (fixed.view("<i4")[:, :, 0] >> 8) / 2.0**bits,
-        np.roll(_rotations(rotation), 1, 1),
+        np.roll(_unpacked(rotation), 1, 1),
         np.exp(scale / 16.0 - 10),
         alpha[:, 0] / 255,
         sh,
@@ -125,7 +113,17 @@ def _bytes(values: NDArray[np.floating]) -> NDArray[np.uint8]:
     return np.rint(values).clip(0, 255).astype("u1")
 
 
-def _rotations(packed: NDArray[np.uint8]) -> NDArray[np.float64]:
+def _packed(quats: NDArray[np.floating]) -> NDArray[np.uint32]:
+    """Encodes quaternions xyzw as the place of the largest component and the others of the one with it positive."""
+    place = np.abs(quats).argmax(1)[:, None]
+    unit = quats / (np.linalg.norm(quats, axis=1, keepdims=True) * np.sign(np.take_along_axis(quats, place, 1)))
+    word = place[:, 0].astype("<u4")
+    for column in unit[np.arange(4) != place].reshape(-1, 3).T:
+        word = word << 10 | (column < 0).astype("<u4") << 9 | np.rint(abs(column) * np.sqrt(2) * 511).astype("<u4")
+    return word
+
+
+def _unpacked(packed: NDArray[np.uint8]) -> NDArray[np.float64]:
     """Decodes the bytes of version 2 or 3 to unit quaternions ``[N, 4]`` xyzw."""
     if packed.shape[1] == 3:
         axis = packed / 127.5 - 1
@@ -133,4 +131,8 @@ def _rotations(packed: NDArray[np.uint8]) -> NDArray[np.float64]:
     word = np.ascontiguousarray(packed).view("<u4")
     parts = word >> np.array([20, 10, 0], "<u4") & 1023
     others = np.where(parts >> 9, -1, 1) * (parts & 511) / (511 * np.sqrt(2))
-    return from_smallest_three(word[:, 0] >> 30, others)
+    largest = np.arange(4) == word >> 30
+    quats = np.empty(largest.shape)
+    quats[~largest] = others.ravel()
+    quats[largest] = np.sqrt(np.maximum(1 - (others**2).sum(1), 0))
+    return quats

@@ -2,10 +2,9 @@
 
 from vg2gt.viewer.content import ViewerScene, load_pictures
 from vg2gt.viewer.page import write_viewer_html
-from vg2gt.viewer.server import MissingViserError, start_server
+from vg2gt.viewer.server import start_server
 
 __all__ = [
-    "MissingViserError",
     "ViewerScene",
     "load_pictures",
     "start_server",

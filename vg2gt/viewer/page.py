@@ -71,16 +71,10 @@ def pack(gaussians: Gaussians) -> tuple[dict[str, float], bytes]:
         components of unit quaternions, 16-bit opacities.
 
     Raises:
-        ValueError: if there is no Gaussian, more than one scene, or a value that is not finite or out of range.
+        ValueError: if there is more than one scene, or a value that is not finite or out of range.
     """
-    if not len(gaussians):
-        raise ValueError("there are no Gaussians to show")
     arrays = to_arrays(gaussians)
-    if np.abs(arrays.means).max() > np.finfo(np.float32).max:
-        raise ValueError("means must fit into float32")
     length = np.linalg.norm(arrays.quats, axis=-1, keepdims=True)
-    if (length == 0).any():
-        raise ValueError("quats must have nonzero norm")
     sh, half_max = arrays.sh, float(np.finfo(np.float16).max)
     while sh.shape[1] > 1 and not sh[:, (math.isqrt(sh.shape[1]) - 1) ** 2 :].any():
         sh = sh[:, : (math.isqrt(sh.shape[1]) - 1) ** 2]

@@ -28,14 +28,10 @@ PORT = 8080
 _LOOK_DEPTHS = 25.0  # distance from a camera to the point to orbit around, in frustum depths
 
 
-class MissingViserError(ImportError):
-    """Raised if the package viser is not installed."""
-
-
 def require_viser() -> None:
-    """Raises MissingViserError, naming the remedy, if viser is not installed."""
+    """Raises ImportError, naming the remedy, if viser is not installed."""
     if importlib.util.find_spec("viser") is None:
-        raise MissingViserError(
+        raise ImportError(
             "the live viewer requires viser: pip install 'vg2gt[view]'; or use --html to write a standalone page"
         )
 
@@ -54,7 +50,7 @@ def start_server(scene: ViewerScene, host: str = LOOPBACK, port: int = PORT, sha
         share: whether the scene may be published with ``request_share_url()``.
 
     Raises:
-        MissingViserError: if viser is not installed; the message names the extra to install.
+        ImportError: if viser is not installed; the message names the extra to install.
     """
     require_viser()
     import viser  # pyright: ignore[reportMissingImports]  # optional

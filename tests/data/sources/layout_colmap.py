@@ -23,7 +23,12 @@ def write(root: Path, frames: Frames, text: bool = False) -> None:
     for name, image in zip(names, pixels(frames), strict=True):
         save(root / "statue" / "images" / name, image)
     world = unproject(frames.depth[None].double(), cameras)[0].numpy()
-    write_colmap(root / "statue" / "sparse" / "0", model_of(cameras, names, world), text=text)
+    folder, model = root / "statue" / "sparse" / "0", model_of(cameras, names, world)
+    write_colmap(folder, model)
+    if text:
+        model.write_text(folder)
+        for path in folder.glob("*.bin"):
+            path.unlink()
 
 
 def model_of(cameras: Cameras, names: list[str], world: np.ndarray, track: int = 3):
