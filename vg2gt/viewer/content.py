@@ -60,13 +60,8 @@ class ViewerScene:
 
     def frustum_depth(self) -> float:
         """Returns the distance from a camera's centre to its drawn image, in scene units."""
-        centers = np.stack([camera_to_world(camera)[:3, 3] for camera in self.cameras or [self.initial()]])
+        centers = np.stack([invert_pose(camera.world_to_camera)[:3, 3] for camera in self.cameras or [self.initial()]])
         return FRUSTUM_SHARE * scene_extent(self.gaussians.means.detach().cpu().double().numpy(), centers)
-
-
-def camera_to_world(camera: NamedCamera) -> NDArray[np.float64]:
-    """Returns the camera-to-world pose ``[4, 4]``."""
-    return invert_pose(camera.world_to_camera)
 
 
 def default_camera(gaussians: Gaussians) -> NamedCamera:

@@ -16,9 +16,9 @@ import torch
 
 from vg2gt.geometry.rotations import matrix_to_quat, quat_to_matrix
 from vg2gt.geometry.spherical_harmonics import DC
-from vg2gt.io.cameras_json import NamedCamera
+from vg2gt.io.cameras_json import NamedCamera, invert_pose
 from vg2gt.types import Gaussians
-from vg2gt.viewer.content import ViewerScene, camera_to_world
+from vg2gt.viewer.content import ViewerScene
 
 if TYPE_CHECKING:
     import viser  # pyright: ignore[reportMissingImports]  # optional
@@ -121,19 +121,32 @@ def _refusing_other_pages(share: bool) -> Iterator[None]:
 def _fill(server: viser.ViserServer, scene: ViewerScene) -> None:
     server.scene.set_up_direction("-y")
     _add_gaussians(server, scene.gaussians)
-    ahead = _LOOK_DEPTHS * scene.frustum_depth()
-    pose = camera_to_world(scene.initial())
+    depth = scene.frustum_depth()
+    pose = invert_pose(scene.initial().world_to_camera)
     server.initial_camera.position = pose[:3, 3]
-    server.initial_camera.look_at = pose[:3, 3] + ahead * pose[:3, 2]
+    server.initial_camera.look_at = pose[:3, 3] + _LOOK_DEPTHS * depth * pose[:3, 2]
     server.initial_camera.up = -pose[:3, 1]
     server.initial_camera.fov = _field_of_view(scene.initial())
     if scene.cameras:
-        _add_cameras(server, scene, ahead)
+        _add_cameras(server, scene, depth)
 
 
-def _add_cameras(server: viser.ViserServer, scene: ViewerScene, ahead: float) -> None:
+def _add_cameras(server: viser.ViserServer, scene: ViewerScene, depth: float) -> None:
     """Adds frusta with their images, checkboxes that hide either, and a dropdown of cameras to look through."""
-    frusta = [_add_frustum(server, scene, index) for index in range(len(scene.cameras))]
+    poses = [invert_pose(camera.world_to_camera) for camera in scene.cameras]
+    frusta = [
+        server.scene.add_camera_frustum(
+            f"/cameras/{index}",  # not the name: a slash in it would make a parent node
+            fov=_field_of_view(camera),
+            aspect=camera.width / camera.height,
+            scale=depth,
+            image=scene.picture(index),
+            wxyz=matrix_to_quat(torch.from_numpy(pose[:3, :3])).numpy(),
+            position=pose[:3, 3],
+            color=(255, 184, 51),
+        )
+        for index, (camera, pose) in enumerate(zip(scene.cameras, poses, strict=True))
+    ]
     pictured = any(scene.picture(index) is not None for index in range(len(frusta)))
     names = [f"{index}: {camera.name}" for index, camera in enumerate(scene.cameras)]
     show_cameras = server.gui.add_checkbox("Cameras", True)
@@ -153,27 +166,13 @@ def _add_cameras(server: viser.ViserServer, scene: ViewerScene, ahead: float) ->
     @chosen.on_update
     def _(event: Any) -> None:
         if event.client is not None:
-            camera = scene.cameras[names.index(chosen.value)]
-            pose = camera_to_world(camera)
+            index = names.index(chosen.value)
+            pose = poses[index]
             with event.client.atomic():
                 event.client.camera.up_direction = -pose[:3, 1]
                 event.client.camera.position = pose[:3, 3]
-                event.client.camera.look_at = pose[:3, 3] + ahead * pose[:3, 2]
-                event.client.camera.fov = _field_of_view(camera)
-
-
-def _add_frustum(server: viser.ViserServer, scene: ViewerScene, index: int) -> viser.CameraFrustumHandle:
-    camera, pose = scene.cameras[index], camera_to_world(scene.cameras[index])
-    return server.scene.add_camera_frustum(
-        f"/cameras/{index}",  # not the name: a slash in it would make a parent node
-        fov=_field_of_view(camera),
-        aspect=camera.width / camera.height,
-        scale=scene.frustum_depth(),
-        image=scene.picture(index),
-        wxyz=matrix_to_quat(torch.from_numpy(pose[:3, :3])).numpy(),
-        position=pose[:3, 3],
-        color=(255, 184, 51),
-    )
+                event.client.camera.look_at = pose[:3, 3] + _LOOK_DEPTHS * depth * pose[:3, 2]
+                event.client.camera.fov = _field_of_view(scene.cameras[index])
 
 
 def _field_of_view(camera: NamedCamera) -> float:
