@@ -122,11 +122,11 @@ def align_cameras(
         ``[B]`` similarities from the predicted to the reference frame, computed in float64, in the input's dtype.
     """
     dtype = predicted.world_to_camera.dtype
-    orientations = [cameras.world_to_camera[..., :3, :3].double() for cameras in (predicted, reference)]
-    rotation = _nearest_rotation((orientations[1].transpose(-1, -2) @ orientations[0]).sum(1))
-
+    own, given = (cameras.world_to_camera[..., :3, :3].double() for cameras in (predicted, reference))
+    rotation = _nearest_rotation((given.transpose(-1, -2) @ own).sum(1))
     source, target = camera_centers(predicted).double(), camera_centers(reference).double()
-    return _umeyama(rotation, source, target, _moves(source) & _moves(target), still_scale, dtype)
+    moves = _moves(source) & _moves(target)
+    return _umeyama(rotation, source, target, moves, still_scale).map(lambda tensor: tensor.to(dtype))
 
 
 def align_points(points: Tensor, reference: Tensor) -> Similarity:
@@ -143,16 +143,11 @@ def align_points(points: Tensor, reference: Tensor) -> Similarity:
     source, target = points.double(), reference.double()
     centered, centered_target = source - source.mean(1)[:, None], target - target.mean(1)[:, None]
     rotation = _nearest_rotation(centered_target.transpose(-1, -2) @ centered)
-    return _umeyama(rotation, source, target, _moves(source), None, points.dtype)
+    return _umeyama(rotation, source, target, _moves(source), None).map(lambda tensor: tensor.to(points.dtype))
 
 
 def _umeyama(
-    rotation: Tensor,
-    source: Tensor,
-    target: Tensor,
-    moves: Tensor,
-    still_scale: Callable[[], Tensor] | None,
-    dtype: torch.dtype,
+    rotation: Tensor, source: Tensor, target: Tensor, moves: Tensor, still_scale: Callable[[], Tensor] | None
 ) -> Similarity:
     """Adds the least-squares scale (or ``still_scale()``) and translation to a rotation (Umeyama 1991, eqn 41, 42)."""
     source_mean, target_mean = source.mean(1), target.mean(1)
@@ -162,7 +157,7 @@ def _umeyama(
     still = 1.0 if still_scale is None or bool(told.all()) else still_scale().double()
     scale = torch.where(told, agreement / turned.square().sum((1, 2)), still)
     translation = target_mean - scale[:, None] * (rotation @ source_mean[..., None])[..., 0]
-    return Similarity(scale.to(dtype), rotation.to(dtype), translation.to(dtype))
+    return Similarity(scale, rotation, translation)
 
 
 def _moves(centers: Tensor) -> Tensor:
