@@ -80,13 +80,12 @@ def test_ordinary_pictures_are_read(tmp_path: Path) -> None:
         assert open_image(buffer).convert("RGB").size == (4, 4), kind
 
 
-def ply(lines: str, encoding: str = "binary_little_endian") -> bytes:
-    return f"ply\nformat {encoding} 1.0\n{lines}end_header\n".encode() + bytes(64)
+def ply(lines: str) -> bytes:
+    return f"ply\nformat binary_little_endian 1.0\n{lines}end_header\n".encode() + bytes(64)
 
 
 POSITION = "property float x\nproperty float y\nproperty float z\n"
 PLYS = {
-    "2^60 lines": ply(f"element vertex {HUGE}\n{POSITION}", "ascii"),
     "2^60 before": ply(f"element other {HUGE}\nproperty double a\nelement vertex 1\n{POSITION}"),
     "10^30 vertices": ply(f"element vertex 1{'0' * 30}\n{POSITION}"),
     "endless header": b"ply\nformat ascii 1.0\n" + b"comment x\n" * 100_000,
