@@ -85,28 +85,19 @@ class Lens:
             size: ``(height, width)`` of the images, used if the file gives none.
 
         Raises:
-            ValueError: if the size is needed and not known, or there is no focal length.
+            ValueError: if the size is not known, or there is no focal length.
         """
-        height = self.height or (size[0] if size else None)
-        width = self.width or (size[1] if size else None)
-        fl_x = _focal(self.fl_x, self.camera_angle_x, width)
-        if fl_x is None:
-            raise ValueError("the focal length needs fl_x, or camera_angle_x and the images' width: pass size")
-        fl_y = _focal(self.fl_y, self.camera_angle_y, height) or fl_x
-        cx, cy = _middle(self.cx, width), _middle(self.cy, height)
-        if cx is None or cy is None:
-            raise ValueError("the principal point needs cx and cy or the images' size: pass size=(height, width)")
+        size = (self.height, self.width) if self.height and self.width else size
+        if size is None or (self.fl_x is None and self.camera_angle_x is None):
+            raise ValueError("intrinsics need fl_x or camera_angle_x, and the images' size: pass size=(height, width)")
+        (height, width), fl_x, fl_y = size, self.fl_x, self.fl_y
+        if fl_x is None and self.camera_angle_x is not None:
+            fl_x = width / 2 / math.tan(self.camera_angle_x / 2)
+        if fl_y is None:
+            fl_y = fl_x if self.camera_angle_y is None else height / 2 / math.tan(self.camera_angle_y / 2)
+        cx = width / 2 if self.cx is None else self.cx
+        cy = height / 2 if self.cy is None else self.cy
         return np.array([[fl_x, 0, cx - PIXEL_CENTER], [0, fl_y, cy - PIXEL_CENTER], [0, 0, 1]])
-
-
-def _focal(focal: float | None, angle: float | None, extent: int | None) -> float | None:
-    if focal is None and angle is not None and extent is not None:
-        return extent / 2 / math.tan(angle / 2)
-    return focal
-
-
-def _middle(center: float | None, extent: int | None) -> float | None:
-    return extent / 2 if center is None and extent is not None else center
 
 
 @dataclass(frozen=True, eq=False)
