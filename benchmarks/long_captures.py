@@ -105,18 +105,18 @@ class Clock(Monitor):
         self.steps: dict[str, list[float]] = {}
 
     @contextmanager
-    def measure(self, name: str) -> Iterator[Callable[[float, str], None]]:
-        """See :meth:`Monitor.measure`."""
+    def stage(self, name: str, total: int = 1) -> Iterator[Callable[..., None]]:
+        """See :meth:`Monitor.stage`."""
         before = time.process_time()
 
-        def show(done: float, note: str) -> None:
+        def advance(done: float | None = None, note: str = "") -> None:
             nonlocal before
             now = time.process_time()
             self.steps.setdefault(name, []).append(now - before)
             before = now
-            print(f"{name} {note}", file=sys.stderr, flush=True)
+            print(f"{name} {len(self.steps[name])} of {total}", file=sys.stderr, flush=True)
 
-        yield show
+        yield advance
 
 
 def score(scene: Scene, folder: Path, numbers: set[int] | None = None) -> dict[int, float]:

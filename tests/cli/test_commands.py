@@ -101,7 +101,7 @@ MISTAKES = {
     "reconstruct . --out x --save scene.fbx": "unknown output 'scene.fbx'",
     "reconstruct . --out x foo=1": "option 'foo=1': expected key=value with a key of backend, model, renderer",
     "render scene.ply --cameras no.json --out x": r"^FileNotFoundError: no cameras at no\.json",
-    "reconstruct . --out x --every 0": "^ValueError: every must be at least 1, got 0",
+    "reconstruct . --out x --max-images 0": "^ValueError: max_images must be at least 1, got 0",
     "export backend=oracle --out bundle": "backend oracle cannot be exported",
     "calibrate": r"there is no place for the calibration: give out=FILE\.json",
     "data views --out views.json evaluation=nonsense": "Could not find 'evaluation/nonsense' Available options",

@@ -66,7 +66,7 @@ def test_the_page_on_refinement(workplace: Path, monkeypatch, capsys: pytest.Cap
     assert (workplace / "outputs" / "sharp" / "refine.png").is_file()
     capsys.readouterr()
     _examples("docs/guides/refine.md")
-    assert capsys.readouterr().out == "True 1\nTrue\n"
+    assert capsys.readouterr().out == "True 20\nTrue\n"
 
 
 def test_python_of_the_readme_and_the_reference(workplace: Path, capsys: pytest.CaptureFixture) -> None:

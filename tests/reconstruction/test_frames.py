@@ -20,7 +20,6 @@ from vg2gt.reconstruction.given_cameras import given_pictures
 from vg2gt.reconstruction.pipeline import reconstruct_with
 from vg2gt.reconstruction.saved import read_scene
 from vg2gt.rendering import Renderer
-from vg2gt.runs.load import load_model
 
 
 @pytest.mark.parametrize("put", [put_colmap, put_transforms, put_cameras])
@@ -31,9 +30,7 @@ def test_given_cameras_keep_their_frame_and_unit(folder: Path, frames, put, tmp_
     for camera in io.read_cameras_json(tmp_path / "out" / "cameras.json"):
         np.testing.assert_allclose(camera.world_to_camera, given[Path(camera.name).stem], atol=1e-6)
         np.testing.assert_allclose(camera.similarity, np.eye(4), atol=1e-5)
-    report = json.loads((tmp_path / "out" / "report.json").read_text())
-    assert report["frame"] == "given"
-    assert report["similarity_to_cameras"]["scale"] == pytest.approx(1, abs=1e-5)
+    assert json.loads((tmp_path / "out" / "report.json").read_text())["frame"] == "given"
     scene = read_scene(tmp_path / "out", Renderer())
     assert scene.frame.name == "given"
     seen = scene.depth[scene.depth > 0].median()
@@ -44,32 +41,32 @@ def test_given_cameras_keep_their_frame_and_unit(folder: Path, frames, put, tmp_
     assert inside.float().mean() > 0.2
 
 
-def test_frames_that_can_be_chosen_go_into_one_another(folder: Path, frames, model, tmp_path: Path) -> None:
-    """The similarity in report.json takes any of them to the given one."""
+def test_the_upright_frame_goes_into_the_given_one(folder: Path, frames, model, monkeypatch) -> None:
+    """As the frame's similarity says; found cameras are written upright."""
     put_colmap(folder, frames)
-    scenes = {name: reconstruct_with(model, folder, frame=name) for name in ("given", "first", "upright")}
-    given = scenes["given"]
-    for name, scene in scenes.items():
-        to_given = torch.from_numpy(scene.frame.to_source).float()
-        means = scene.gaussians.means @ to_given[:3, :3].T + to_given[:3, 3]
-        torch.testing.assert_close(means, given.gaussians.means, atol=2e-4, rtol=0)
-        scale = float(torch.linalg.det(to_given[:3, :3]) ** (1 / 3))
-        torch.testing.assert_close(scene.gaussians.scales * scale, given.gaussians.scales, atol=1e-6, rtol=1e-3)
-        torch.testing.assert_close(scene.depth * scale, given.depth, atol=1e-5, rtol=1e-4)
-        one, other = next(scene.render()), next(given.render())
-        assert (one.color - other.color).abs().mean() < 2e-3, name
-    assert torch.allclose(scenes["first"].cameras.world_to_camera[0, 0], torch.eye(4), atol=1e-5)
-    down = scenes["upright"].cameras.world_to_camera[0, :, 1, :3].mean(0)
+    given = reconstruct_with(model, folder)
+    monkeypatch.setattr("vg2gt.reconstruction.pipeline.SFM_SOURCE", "COLMAP")
+    scene = reconstruct_with(model, folder)
+    assert scene.frame.name == "upright"
+    to_given = torch.from_numpy(scene.frame.to_source).float()
+    means = scene.gaussians.means @ to_given[:3, :3].T + to_given[:3, 3]
+    torch.testing.assert_close(means, given.gaussians.means, atol=2e-4, rtol=0)
+    scale = float(torch.linalg.det(to_given[:3, :3]) ** (1 / 3))
+    torch.testing.assert_close(scene.gaussians.scales * scale, given.gaussians.scales, atol=1e-6, rtol=1e-3)
+    torch.testing.assert_close(scene.depth * scale, given.depth, atol=1e-5, rtol=1e-4)
+    assert (next(scene.render()).color - next(given.render()).color).abs().mean() < 2e-3
+    down = scene.cameras.world_to_camera[0, :, 1, :3].mean(0)
     assert down[1] / down.norm() > 0.9
-    assert scenes["upright"].metres_per_unit is None
+    assert scene.metres_per_unit is None
 
 
-def test_metric_cameras_give_metres(recording: Path, ready) -> None:
+def test_metric_cameras_give_metres(recording: Path, ready, monkeypatch) -> None:
     scene = reconstruct_with(ready.model, recording)
     assert scene.metres_per_unit == pytest.approx(1)
-    first = reconstruct_with(ready.model, recording, frame="first")
-    assert first.metres_per_unit == pytest.approx(first.frame.scale)
-    assert first.metres_per_unit != pytest.approx(1, abs=0.01)
+    monkeypatch.setattr("vg2gt.reconstruction.pipeline.SFM_SOURCE", "RGBDFolder")
+    upright = reconstruct_with(ready.model, recording)
+    assert upright.metres_per_unit == pytest.approx(upright.frame.scale)
+    assert upright.metres_per_unit != pytest.approx(1, abs=0.01)
 
 
 def test_map_coordinates_keep_their_digits(folder: Path, frames, model, caplog) -> None:
@@ -84,13 +81,6 @@ def test_map_coordinates_keep_their_digits(folder: Path, frames, model, caplog) 
     np.testing.assert_allclose(scene.frame.to_source[:3, 3], shift, atol=20)
     for camera, pose in zip(scene.named_cameras(), poses.numpy(), strict=True):
         np.testing.assert_allclose(camera.world_to_camera @ np.linalg.inv(scene.frame.to_source), pose, atol=2e-6 * 4e6)
-
-
-def test_there_is_no_given_frame_without_given_cameras(photos: Path) -> None:
-    images_alone = load_model(backend="da3_tiny", device="cpu").model
-    with pytest.raises(ValueError, match="no cameras are given, so --frame given is not possible"):
-        reconstruct_with(images_alone, photos, frame="given")
-    assert reconstruct_with(images_alone, photos).frame.name == "upright"
 
 
 def test_gravity_is_across_the_cameras_even_if_they_look_down() -> None:

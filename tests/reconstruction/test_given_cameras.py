@@ -89,9 +89,8 @@ def test_depth_is_read_where_a_recording_has_it(recording: Path, tmp_path: Path,
     check_cameras(given_pictures(tmp_path / "room"), frames, "cameras.json")
 
 
-def test_every_and_max_images(folder: Path, recording: Path) -> None:
+def test_max_images(folder: Path, recording: Path) -> None:
     put_poses(folder, recording)
-    assert [p.name for p in given_pictures(folder, every=2) or []] == ["008", "010"]
     assert [p.name for p in given_pictures(folder, max_images=2) or []] == ["008", "011"]
     both = given_pictures([folder / "images" / "010.png", folder / "images" / "008.png"])
     assert [p.name for p in both or []] == ["010", "008"]
@@ -145,16 +144,13 @@ def test_who_gets_which_cameras(model, folder: Path, recording: Path, ready, mon
     assert asked == [4]
     assert {p.source for p in choose(model, folder, "sfm", max_images=3)} == {"sfm"}
     assert asked == [4, 3]
-    with pytest.raises(ValueError, match="plane_ahead predicts no cameras"):
-        choose(model, folder, "backbone")
-    for poses in ("auto", "backbone"):
-        assert {p.source for p in choose(images_alone, folder, poses)} == {""}
+    assert {p.source for p in choose(images_alone, folder)} == {""}
     for poses in ("given", "sfm"):
         with pytest.raises(ValueError, match="da3_tiny predicts its own cameras and accepts none"):
             choose(images_alone, folder, poses)
     with pytest.raises(ValueError, match="works from the depth and poses of a recording"):
         choose(ready.model, recording, "sfm")
-    with pytest.raises(ValueError, match="choose one of auto, given, sfm, backbone"):
+    with pytest.raises(ValueError, match="choose one of auto, given, sfm"):
         choose(model, folder, "mine")
     assert asked == [4, 3]
 

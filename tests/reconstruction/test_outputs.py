@@ -1,8 +1,6 @@
 """Every output is read back by its reader and says the same as the scene in memory."""
 
 import json
-import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,25 +10,20 @@ import trimesh
 from PIL import Image
 
 from vg2gt import io
-from vg2gt.geometry.cameras import project, scale_translations
+from vg2gt.geometry.cameras import project
 from vg2gt.reconstruction.output_names import OUTPUTS
 from vg2gt.reconstruction.outputs import write_outputs
 from vg2gt.reconstruction.scene import Scene
-from vg2gt.types import Cameras
-
-VIDEOS = ("orbit.mp4",)  # needs PyAV
 
 
 @pytest.fixture(scope="module")
 def written(scene: Scene, tmp_path_factory) -> Path:
-    outputs = [name for name in OUTPUTS if name not in VIDEOS]
-    folder = tmp_path_factory.mktemp("out") / "new"
-    return write_outputs(scene, folder, outputs, frames=4, figures={"weights": "<none>"})
+    return write_outputs(scene, tmp_path_factory.mktemp("out") / "new", list(OUTPUTS))
 
 
 def test_gaussians_and_cameras(written: Path, scene: Scene) -> None:
     folders = {"color", "depth", "normals"}
-    names = {name for name in OUTPUTS if name.split(".")[0] not in folders} - set(VIDEOS)
+    names = {name for name in OUTPUTS if name.split(".")[0] not in folders}
     assert {path.name for path in written.iterdir()} == names | folders  # only what was asked
     back = io.read_gaussian_ply(written / "scene.ply")
     for field in ("means", "scales", "opacities"):
@@ -41,7 +34,6 @@ def test_gaussians_and_cameras(written: Path, scene: Scene) -> None:
     poses = torch.cat([camera.cameras().world_to_camera for camera in cameras], 1)
     assert torch.equal(poses, scene.cameras.world_to_camera)
     assert all((camera.height, camera.width) == scene.cameras.size for camera in cameras)
-    assert all((written / "images" / camera.name).is_file() for camera in cameras)
 
 
 def test_maps(written: Path, scene: Scene) -> None:
@@ -49,13 +41,9 @@ def test_maps(written: Path, scene: Scene) -> None:
         stem = Path(camera.name).stem
         depth = np.load(written / "depth" / f"{stem}.npy")
         assert np.array_equal(depth, view.depth.numpy())
-        stored = np.array(Image.open(written / "depth" / f"{stem}.png"))
-        assert stored.dtype == np.uint16
-        assert np.abs(stored / 1000 - depth).max() <= 5.1e-4
         color = np.array(Image.open(written / "color" / f"{stem}.png")) / 255
         assert np.abs(color - view.color.permute(1, 2, 0).numpy()).max() < 1 / 500
         assert np.array_equal(np.load(written / "normals" / f"{stem}.npy"), view.normal.numpy())
-        assert Image.open(written / "normals" / f"{stem}.png").size == (112, 84)
 
 
 def test_colmap_points_fall_on_their_pixels_and_have_tracks(written: Path, scene: Scene) -> None:
@@ -94,10 +82,7 @@ def test_nerfstudio(written: Path, scene: Scene) -> None:
 
 def test_points_and_meshes_lie_on_the_surfaces(written: Path, scene: Scene) -> None:
     points = np.array(trimesh.load(written / "points.ply").vertices)
-    loaded = trimesh.load(written / "points.glb")
-    assert isinstance(loaded, trimesh.Scene)
-    assert set(loaded.geometry) == {"points", "cameras"}
-    for suffix in ("ply", "glb", "obj"):
+    for suffix in ("ply", "glb"):
         assert len(trimesh.load_mesh(written / f"mesh.{suffix}").faces) > 1000
     vertices = torch.from_numpy(np.array(trimesh.load_mesh(written / "mesh.ply").vertices)).float()
     for candidates, tolerance in ((torch.from_numpy(points).float(), 0.01), (vertices, 0.06)):
@@ -109,18 +94,12 @@ def test_points_and_meshes_lie_on_the_surfaces(written: Path, scene: Scene) -> N
         assert error.median() < tolerance
 
 
-def test_animation_and_reports(written: Path, scene: Scene) -> None:
-    frames = [frame for _, frame in io.read_video(written / "orbit.gif")]
-    assert [frame.shape for frame in frames] == [(84, 112, 3)] * 4
+def test_reports(written: Path, scene: Scene) -> None:
     assert Image.open(written / "report.png").size == (5 * 112 + 16, 4 * 84 + 12)
     figures = json.loads((written / "report.json").read_text())
     assert (figures["views"], figures["gaussians"]) == (4, len(scene.gaussians))
-    assert set(figures["seconds"]) >= {"write files", "render views", "render orbit"}
+    assert set(figures["seconds"]) >= {"write files", "render views"}
     assert figures["peak_memory_mib"] > 100
-    page = (written / "report.html").read_text()
-    assert (page.count("data:image/jpeg;base64,"), page.count("data:image/gif;base64,")) == (20, 1)
-    assert "&lt;none&gt;" in page
-    assert "http" not in re.sub(r"base64,[\w+/=]*", "", page)
 
 
 def test_nothing_is_replaced_unasked(written: Path, scene: Scene, tmp_path: Path) -> None:
@@ -130,16 +109,3 @@ def test_nothing_is_replaced_unasked(written: Path, scene: Scene, tmp_path: Path
     (tmp_path / "color" / "stale.png").touch()
     write_outputs(scene, tmp_path, ["color.png"], overwrite=True)
     assert not (tmp_path / "color" / "stale.png").exists()
-
-
-def test_depth_too_deep_for_a_png_is_said(scene: Scene, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    gaussians = replace(scene.gaussians, means=scene.gaussians.means * 30, scales=scene.gaussians.scales * 30)
-    first = scene.cameras.select(slice(0, 1))
-    cameras = Cameras(scale_translations(first, torch.tensor([30.0])).world_to_camera, first.intrinsics, first.size)
-    parts = {"gaussians": gaussians, "cameras": cameras, "images": scene.images[:1], "depth": scene.depth[:1] * 30}
-    far = replace(scene, **parts, names=scene.names[:1])
-    write_outputs(far, tmp_path, ["depth.png"])
-    assert "save depth.npy" in caplog.text
-    stored = np.array(Image.open(tmp_path / "depth" / "008.png"))
-    assert (stored == 0).any()
-    assert (stored > 50_000).any()

@@ -14,8 +14,7 @@ from vg2gt.geometry.alignment import align_points
 from vg2gt.geometry.cameras import camera_centers, invert_rigid, ray_directions, rigid_motions
 from vg2gt.reconstruction.given_cameras import given_pictures
 from vg2gt.reconstruction.monitor import Monitor
-from vg2gt.reconstruction.windows.placement import place_found
-from vg2gt.reconstruction.windows.pose_graph import Found, closes, loop_candidates, place_windows
+from vg2gt.reconstruction.windows.placement import Found, closes, loop_candidates, place_found, place_windows
 from vg2gt.reconstruction.windows.run import WindowRun, found_of
 from vg2gt.runs.load import load_model
 from vg2gt.types import Cameras

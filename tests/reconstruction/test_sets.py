@@ -13,10 +13,10 @@ from tests.reconstruction.test_windows import BY_ITSELF, built
 from vg2gt.cli import reconstruct as command
 from vg2gt.data import SyntheticScenes
 from vg2gt.io import read_cameras_json, read_gaussian_ply
-from vg2gt.reconstruction.changes import add_images, take_out
 from vg2gt.reconstruction.monitor import Monitor
+from vg2gt.reconstruction.pipeline import add_images, take_out
 from vg2gt.reconstruction.windows.run import gaussians_of
-from vg2gt.reconstruction.windows.sets import finished_sets, read_anchor
+from vg2gt.reconstruction.windows.store import finished_sets, read_anchor
 from vg2gt.rendering import Renderer
 
 SETS = 4

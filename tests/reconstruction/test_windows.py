@@ -19,7 +19,7 @@ from vg2gt.reconstruction.pipeline import reconstruct_with
 from vg2gt.reconstruction.windows import capture
 from vg2gt.reconstruction.windows import run as windows_run
 from vg2gt.reconstruction.windows.capture import cut, window_size
-from vg2gt.reconstruction.windows.merging import merge_windows
+from vg2gt.reconstruction.windows.store import merge_windows
 from vg2gt.runs.load import load_model
 
 BY_ITSELF = ["backend=custom", f"backend._target_={ByItself.__module__}.ByItself", "model=tiny_ungated"]
@@ -132,9 +132,9 @@ def test_other_views_do_not_go_on_with_the_files_of_these(model, walk, whole, tm
 def test_merging_in_slabs_changes_nothing(model, walk, tmp_path, monkeypatch) -> None:
     found = {}
 
-    def both(files, show):
-        found["whole"] = merge_windows(files, show)
-        found["slabs"] = merge_windows(files, show, limit=500)
+    def both(files, monitor):
+        found["whole"] = merge_windows(files, monitor)
+        found["slabs"] = merge_windows(files, monitor, limit=500)
         return found["whole"]
 
     monkeypatch.setattr(windows_run, "merge_windows", both)

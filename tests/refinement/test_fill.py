@@ -10,7 +10,7 @@ import torch
 from tests.refinement.conftest import VIEWS, Start, run
 from vg2gt.geometry.cameras import project
 from vg2gt.refinement import RefineOptions
-from vg2gt.refinement.fill import COVERED, fill_holes, spread
+from vg2gt.refinement.density import COVERED, fill_holes, spread
 from vg2gt.types import Gaussians
 
 ROOM = 10_000

@@ -1,6 +1,7 @@
 """Whole refinements: they sharpen, repeat to the bit, survive Ctrl-C and bad numbers, and never see held-out views."""
 
 import logging
+import time
 from dataclasses import fields, replace
 from importlib import import_module
 
@@ -9,7 +10,7 @@ import torch
 
 from tests.refinement.conftest import VIEWS, Start, run
 from vg2gt.geometry.rotations import quat_to_matrix
-from vg2gt.refinement import Progress, Refined, RefinedScene, RefineLoss, RefineOptions, RefineRates
+from vg2gt.refinement import Refined, RefinedScene, RefineLoss, RefineOptions, RefineRates
 from vg2gt.refinement.density import GROWTH, merged, supported
 from vg2gt.types import Gaussians
 
@@ -19,11 +20,17 @@ COLOUR = RefineLoss(depth_consistency=0, normal_render=0, normal_decoded=0)
 def same(first: RefinedScene, second: RefinedScene) -> bool:
     names = [field.name for field in fields(first.gaussians) if field.name != "background"]
     pairs = [(getattr(first.gaussians, name), getattr(second.gaussians, name)) for name in names]
-    pairs += [(first.cameras.world_to_camera, second.cameras.world_to_camera), (first.gain, second.gain)]
+    pairs += [(first.cameras.world_to_camera, second.cameras.world_to_camera)]
     return all(torch.equal(a, b) for a, b in pairs)
 
 
-OPTIONS = RefineOptions(steps=24, check_every=8, holdout=3, split_share=0.05, rates=RefineRates(exposure=0.002))
+OPTIONS = RefineOptions(steps=24, check_every=8, holdout=3)
+
+
+def begun(start: Start, options: RefineOptions) -> int:
+    """Number of Gaussians that a refinement begins with."""
+    parts = (start.gaussians, start.cameras, start.seen, start.renderer, options, time.monotonic)
+    return len(import_module("vg2gt.refinement.refine")._Refinement(*parts).parameters.origin)
 
 
 @pytest.fixture(scope="module")
@@ -37,21 +44,15 @@ def test_held_out_views_become_sharper(refined: Refined) -> None:
     assert (after[refined.trained] > before[refined.trained] + 1.5).all()
     assert (after - before)[refined.held_out].mean() > 1
     assert refined.ended == "steps"
-    assert [check.step for check in refined.checks] == [8, 16, 24]
-    assert refined.checks[-1].score < 0.9
 
 
-def test_the_first_camera_stays_the_others_move_and_exposures_share_nothing(refined: Refined, start: Start) -> None:
+def test_the_first_camera_stays_and_the_others_move(refined: Refined, start: Start) -> None:
     found, before = refined.scene.cameras, start.cameras
     moved = (found.world_to_camera - before.world_to_camera).abs().amax((0, 2, 3))
     assert moved[0] == 0
     assert (moved[refined.trained[1:]] > 0).all()
     rotation = found.world_to_camera[0, :, :3, :3]
     torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3).expand(VIEWS, 3, 3), atol=1e-5, rtol=0)
-    gain = refined.scene.gain
-    assert gain[refined.trained].log().mean(0).abs().max() < 1e-6
-    assert (gain[refined.trained] != 1).any()
-    assert (gain[refined.held_out] == 1).all()
 
 
 def test_it_repeats_to_the_bit_and_never_looks_at_held_out_views(refined: Refined, start: Start) -> None:
@@ -63,15 +64,11 @@ def test_it_repeats_to_the_bit_and_never_looks_at_held_out_views(refined: Refine
     assert not torch.equal(again.psnr[1, refined.held_out], refined.psnr[1, refined.held_out])
 
 
-def test_it_splits_within_the_limit(refined: Refined, start: Start) -> None:
-    assert len(start.gaussians) < len(refined.scene.gaussians) <= 1.5 * len(start.gaussians)
-    capped = run(start, RefineOptions(steps=4, check_every=2, split_share=0.5, max_growth=1.1, loss=COLOUR))
-    assert len(capped.scene.gaussians) <= 1.1 * len(start.gaussians)
-
-
 def test_an_interruption_keeps_the_best_state(start: Start) -> None:
-    def interrupt(progress: Progress) -> None:
-        if progress.step == 7:
+    def interrupt(step: int, done: float, psnr: float) -> None:
+        assert done == step / 100
+        assert psnr > 10
+        if step == 7:
             raise KeyboardInterrupt
 
     stopped = run(start, RefineOptions(steps=100, check_every=5, loss=COLOUR), observe=interrupt)
@@ -107,9 +104,10 @@ def test_what_few_views_support_is_left_out_at_the_start(start: Start) -> None:
     assert (kept.means == means[1]).all(-1).any()
     assert not (kept.means == means[0]).all(-1).any()
     assert 0.3 * len(start.gaussians) < len(kept) < len(more)
-    found = run(replace(start, gaussians=more), RefineOptions(steps=2, check_every=2, min_views=2, fill=0, loss=COLOUR))
-    assert found.checks[0].gaussians == len(kept)
+    options = RefineOptions(steps=2, check_every=2, min_views=2, fill=0, loss=COLOUR)
+    found = run(replace(start, gaussians=more), options)
     assert torch.equal(found.start.gaussians.means, more.means)
+    assert begun(replace(start, gaussians=more), options) == len(kept)
 
 
 def test_what_two_views_support_starts_coarse(start: Start) -> None:
@@ -123,7 +121,7 @@ def test_what_two_views_support_starts_coarse(start: Start) -> None:
     assert coarse.scales.max(-1).values.median() > 2 * strong.scales.max(-1).values.median()
     options = RefineOptions(steps=2, check_every=2, min_views=3, merge_cells=8.0, fill=0, loss=COLOUR)
     refined = run(start, options)
-    assert refined.checks[0].gaussians == len(found)
+    assert begun(start, options) == len(found)
     # two steps do not make up for the fewer Gaussians: the scene that was given comes back
     assert (refined.step, len(refined.scene.gaussians)) == (0, len(gaussians))
     assert torch.equal(refined.psnr[0], refined.psnr[1])
@@ -149,6 +147,11 @@ def test_merged_gaussians_have_the_moments_of_their_mixture() -> None:
     torch.testing.assert_close(found.sh[0, 0], torch.tensor([0.25, 0.75, 0.0]))
     alone = quat_to_matrix(quats[2]) * scales[2]
     torch.testing.assert_close((axes @ axes.mT)[1], alone @ alone.T)
+
+
+def test_a_weight_on_the_opacity_makes_gaussians_more_transparent(start: Start) -> None:
+    plain, light = (run(start, RefineOptions(steps=4, loss=replace(COLOUR, opacity=w), fill=0)) for w in (0.0, 5.0))
+    assert light.scene.gaussians.opacities.mean() < plain.scene.gaussians.opacities.mean()
 
 
 def test_the_guard_compares_the_same_views(start: Start) -> None:

@@ -3,10 +3,9 @@
 from omegaconf import DictConfig
 
 from vg2gt.cli.arguments import hydra_command
-from vg2gt.cli.commands import COMMANDS
 
 
-@hydra_command(COMMANDS["ablate"], "ablate")
+@hydra_command("ablate")
 def main(config: DictConfig) -> None:
     """Runs the study that the configuration describes."""
     from vg2gt.studies.ablation import run_study

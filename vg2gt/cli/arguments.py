@@ -15,7 +15,7 @@ from hydra.errors import ConfigCompositionException
 from omegaconf import DictConfig
 
 from vg2gt.cli import folders
-from vg2gt.cli.commands import Command
+from vg2gt.cli.commands import COMMANDS, DATA_COMMANDS
 from vg2gt.cli.errors import errors_in_one_line
 from vg2gt.config import config_dir, near_keys
 
@@ -24,11 +24,10 @@ folders.register()
 OVERRIDE = re.compile(r"(\+\+?|~)?[A-Za-z_][\w./]*=")
 OVERRIDES = "\nmodel, backend and renderer are chosen by key=value: backend=da3_small model.fine.max_voxels=500000"
 
-DROP = "drop Gaussians by status, a list of: guessed, contradicted, single (seen by one view), unseen"
 
-
-def hydra_command(command: Command, config_name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
-    """Decorator that turns a function of a configuration into a Hydra command, with sweeps and a run folder."""
+def hydra_command(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
+    """Decorator that turns a function of the configuration ``NAME.yaml`` into a Hydra command, with sweeps."""
+    command = COMMANDS[name]
 
     def decorate(run: Callable[[DictConfig], None]) -> Callable[[], None]:
         """Returns the command that runs the function."""
@@ -45,10 +44,10 @@ def hydra_command(command: Command, config_name: str) -> Callable[[Callable[[Dic
                 print(f"{command.does}\n\nexample: {command.example}\n")
             try:
                 with errors_in_one_line():
-                    hydra.main(version_base="1.3", config_path=config_dir(), config_name=config_name)(job)()
+                    hydra.main(version_base="1.3", config_path=config_dir(), config_name=name)(job)()
             except SystemExit as ended:
                 if isinstance(ended.__context__, ConfigCompositionException):
-                    print(near_keys(config_name, sys.argv[1:]), end="", file=sys.stderr)
+                    print(near_keys(name, sys.argv[1:]), end="", file=sys.stderr)
                 raise
 
         return main
@@ -56,8 +55,9 @@ def hydra_command(command: Command, config_name: str) -> Callable[[Callable[[Dic
     return decorate
 
 
-def flag_parser(name: str, command: Command, details: str = "") -> argparse.ArgumentParser:
+def flag_parser(name: str, details: str = "") -> argparse.ArgumentParser:
     """Creates the parser of a command with flags; its help ends with the example and ``details``."""
+    command = (COMMANDS | {f"data {each}": found for each, found in DATA_COMMANDS.items()})[name]
     return argparse.ArgumentParser(
         f"vg2gt {name}",
         description=f"{command.does[0].upper()}{command.does[1:]}.",
@@ -74,13 +74,6 @@ def add_common_flags(parser: argparse.ArgumentParser, saved: Sequence[str]) -> N
     add("--device", default="auto", help="auto, cpu, cuda, cuda:N")
     add("--overwrite", action="store_true", help="replace existing outputs")
     add("--quiet", action="store_true", help="no progress bars")
-
-
-def add_trust_flags(parser: argparse.ArgumentParser) -> None:
-    """Adds the flags that filter Gaussians by their error bound and status."""
-    add = parser.add_argument
-    add("--min-confidence", type=float, metavar="C", help="drop Gaussians whose depth error bound exceeds 1 - C")
-    add("--drop", type=list_of_names, default=[], metavar="LIST", help=DROP)
 
 
 def separate(argv: Sequence[str] | None) -> tuple[list[str], list[str]]:

@@ -5,10 +5,9 @@ from __future__ import annotations
 from omegaconf import DictConfig
 
 from vg2gt.cli.arguments import hydra_command
-from vg2gt.cli.commands import COMMANDS
 
 
-@hydra_command(COMMANDS["calibrate"], "calibrate")
+@hydra_command("calibrate")
 def main(config: DictConfig) -> None:
     """Runs the calibration that the configuration describes."""
     from vg2gt.evaluation.calibrate import make_calibration

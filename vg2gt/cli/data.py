@@ -33,7 +33,7 @@ def main() -> None:
 def splits(argv: Sequence[str] | None = None) -> None:
     """Divides the scenes of a dataset into training and evaluation lists."""
     given, overrides = separate(argv)
-    parser = flag_parser("data splits", DATA_COMMANDS["splits"], SPLITS)
+    parser = flag_parser("data splits", SPLITS)
     add = parser.add_argument
     add("--out", type=Path, required=True, metavar="DIR", help="where train.txt and val.txt are written")
     add("--fraction", type=float, default=0.1, metavar="X", help="fraction of the places for val.txt, default 0.1; "
@@ -53,7 +53,7 @@ def splits(argv: Sequence[str] | None = None) -> None:
 def views(argv: Sequence[str] | None = None) -> None:
     """Writes an index of the scenes and views that an evaluation uses."""
     given, overrides = separate(argv)
-    parser = flag_parser("data views", DATA_COMMANDS["views"], VIEWS)
+    parser = flag_parser("data views", VIEWS)
     parser.add_argument("--out", required=True, metavar="FILE.json", help="the index to write")
     with errors_in_one_line():
         print(write_views(parser.parse_args(given).out, overrides))

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 import vg2gt
 from vg2gt.cli.arguments import flag_parser
-from vg2gt.cli.commands import COMMANDS
 from vg2gt.cli.errors import errors_in_one_line
 
 if TYPE_CHECKING:
@@ -23,7 +22,7 @@ NEEDED = ("torch", "lightning", "numba", "numpy")
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Prints each finding on one line, as soon as it is known."""
-    flag_parser("doctor", COMMANDS["doctor"]).parse_args(argv)
+    flag_parser("doctor").parse_args(argv)
     with errors_in_one_line():
         for what, found in findings():
             print(f"{what:<12} {found}", flush=True)
@@ -68,24 +67,12 @@ def _optional() -> Iterator[tuple[str, str]]:
 
 
 def _folders() -> Iterator[tuple[str, str]]:
-    """Cache folders of data and compiled kernels, with their sizes."""
+    """Cache folders of data and compiled kernels."""
     from vg2gt.kernels.compiled import cache_folder
 
     data = Path(os.environ.get("VG2GT_CACHE", "~/.cache/vg2gt")).expanduser()
-    yield "data", f"{data} ({_size(data)}; set VG2GT_CACHE to use another folder)"
-    kernels = cache_folder()
-    yield (
-        "kernels",
-        "no writable cache folder: every process recompiles" if kernels is None else f"{kernels} ({_size(kernels)})",
-    )
-    triton = Path(os.environ.get("TRITON_CACHE_DIR", "~/.triton/cache")).expanduser()
-    yield "triton", f"{triton} ({_size(triton)})"
-
-
-def _size(folder: Path) -> str:
-    if not folder.is_dir():
-        return "does not exist yet"
-    return f"{sum(path.stat().st_size for path in folder.rglob('*') if path.is_file()) / 1e6:.0f} MB"
+    yield "data", f"{data} (set VG2GT_CACHE to use another folder)"
+    yield "kernels", str(cache_folder() or "no writable cache folder: every process recompiles")
 
 
 def _renderer(device: torch.device) -> Iterator[tuple[str, str]]:

@@ -7,7 +7,6 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 
 from vg2gt.cli.arguments import hydra_command
-from vg2gt.cli.commands import COMMANDS
 
 
 def run_name(ckpt: str | None) -> str:
@@ -22,7 +21,7 @@ def run_name(ckpt: str | None) -> str:
 OmegaConf.register_new_resolver("run_name", run_name, replace=True)
 
 
-@hydra_command(COMMANDS["evaluate"], "evaluate")
+@hydra_command("evaluate")
 def main(config: DictConfig) -> None:
     """Runs the evaluation that the configuration describes."""
     from vg2gt.evaluation.run import evaluate

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from vg2gt.cli.arguments import flag_parser, separate
-from vg2gt.cli.commands import COMMANDS
 from vg2gt.cli.errors import errors_in_one_line
 from vg2gt.config import compose_groups
 
@@ -19,7 +18,7 @@ The numbers of scenes, views, rows and columns stay dynamic."""
 def main(argv: Sequence[str] | None = None) -> None:
     """Writes the bundle; errors are reported in one line."""
     given, overrides = separate(argv)
-    parser = flag_parser("export", COMMANDS["export"], DETAILS)
+    parser = flag_parser("export", DETAILS)
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder")
     out = parser.parse_args(given).out
     if not any(override.startswith("backend=") for override in overrides):

@@ -8,16 +8,14 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from vg2gt.cli.arguments import OVERRIDES, add_common_flags, add_trust_flags, flag_parser, listing, separate
-from vg2gt.cli.commands import COMMANDS
+from vg2gt.cli.arguments import OVERRIDES, add_common_flags, flag_parser, list_of_names, listing, separate
 from vg2gt.cli.errors import errors_in_one_line
-from vg2gt.cli.refine import options_for, print_refinement
+from vg2gt.cli.refine import options_for
 from vg2gt.reconstruction.output_names import (
     DEFAULT,
     LARGE,
-    ORBIT_FRAMES,
     OUTPUTS,
     PREDICTED,
     REFINED,
@@ -27,13 +25,8 @@ from vg2gt.reconstruction.output_names import (
 )
 
 POSES = (
-    "cameras from files next to the images, from structure from motion (kept in DIR/sfm), or the backbone's own; auto: "
-    "the first of these that is available and that the backbone needs"
-)
-
-FRAME = (
-    "frame and unit of what is written: of the given cameras, of the first image's camera, or upright (y down); auto: "
-    "given if cameras are given, else upright"
+    "cameras from files next to the images, or from structure from motion (kept in DIR/sfm); auto: the first of these "
+    "that is available, if the backbone needs any"
 )
 
 WINDOW = (
@@ -52,7 +45,7 @@ if TYPE_CHECKING:
 
 def parser() -> argparse.ArgumentParser:
     """The command's arguments."""
-    arguments = flag_parser("reconstruct", COMMANDS["reconstruct"], OVERRIDES + listing(OUTPUTS))
+    arguments = flag_parser("reconstruct", OVERRIDES + listing(OUTPUTS))
     add = arguments.add_argument
     add("images", nargs="+", help="image files, a folder of them, a video, or a recording with known cameras")
     place = arguments.add_mutually_exclusive_group(required=True).add_argument
@@ -61,19 +54,17 @@ def parser() -> argparse.ArgumentParser:
     place("--take-out", metavar="DIR", help="remove the images of one --add from the scene in DIR")
     add("--ckpt", metavar="PATH", help="a checkpoint or a run's folder; default: the shipped weights for "
         "backend=sweep, an untrained head for others")  # fmt: skip
-    add("--poses", choices=("auto", "given", "sfm", "backbone"), default="auto", help=POSES)
-    add("--frame", choices=("auto", "given", "first", "upright"), default="auto", help=FRAME)
+    add("--poses", choices=("auto", "given", "sfm"), default="auto", help=POSES)
     add("--size", type=_size, metavar="N|HxW", help="longer side, or height x width, in pixels; default 518, CPU 280")
-    add("--every", type=int, default=1, metavar="N", help="take every N-th image or frame only")
     add("--max-images", type=int, metavar="N", help="use at most N, evenly spaced; default: all, 32 of a video")
     add("--window", type=int, metavar="N", help=WINDOW)
     add("--keep-windows", action="store_true", help="keep what --add and --take-out need in DIR/windows")
-    add("--refine", type=_steps, metavar="N", help=REFINE)
-    add("--frames", type=int, default=ORBIT_FRAMES, metavar="N", help=f"length of the orbit, default {ORBIT_FRAMES}")
+    add("--refine", type=int, metavar="N", help=REFINE)
     add("--mesh-voxel", type=float, metavar="X", help="edge of the mesh's voxels in scene units")
     add("--calibration", metavar="FILE", help="calibration file of the error bounds; default: next to the checkpoint")
-    add("--skip-damaged", action="store_true", help="skip images that cannot be read")
-    add_trust_flags(arguments)
+    add("--min-confidence", type=float, metavar="C", help="drop Gaussians whose depth error bound exceeds 1 - C")
+    add("--drop", type=list_of_names, default=[], metavar="LIST", help="drop Gaussians by status, a list of: guessed, "
+        "contradicted, single (seen by one view), unseen")  # fmt: skip
     add_common_flags(arguments, DEFAULT)
     return arguments
 
@@ -99,9 +90,9 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     from vg2gt.memory import RECONSTRUCTION, memory_advice
     from vg2gt.reconstruction.monitor import Monitor
     from vg2gt.reconstruction.outputs import cost_figures, write_outputs
-    from vg2gt.reconstruction.refined import refine_scene
+    from vg2gt.reconstruction.refined import refine_scene, refinement_lines
     from vg2gt.reconstruction.trust import trust_line, trusted
-    from vg2gt.reconstruction.windows.sets import tidy
+    from vg2gt.reconstruction.windows.store import tidy
     from vg2gt.runs.load import choose_device, load_model
 
     changed = options.add or options.take_out
@@ -118,14 +109,18 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
         scene = trusted(scene, options.min_confidence, options.drop)
         if len(scene.gaussians) > LARGE and TILES not in options.save:
             options.save.append(TILES)
-        figures = _figures(ready)
+        trained = bool(ready.model.trained_parameters())
+        figures = {
+            "model": type(ready.model).__name__,
+            "backend": ready.model.backend.identity(),
+            "weights": str(ready.weights) if trained else "none: the model has no trained part",
+        }
         with memory_advice(RECONSTRUCTION):
             folder = write_outputs(
                 scene,
                 options.out,
                 options.save,
                 overwrite=options.overwrite,
-                frames=options.frames,
                 mesh_voxel=options.mesh_voxel,
                 figures=figures,
                 monitor=monitor,
@@ -139,7 +134,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     height, width = scene.cameras.size
     print(f"{len(scene.names)} images of {height}x{width}: {len(scene.gaussians)} Gaussians")
     if scene.refined is not None:
-        print_refinement(scene)
+        print(*refinement_lines(scene), sep="\n")
     print(trust_line(scene))
     print(f"weights: {figures['weights']}; cameras: {scene.cameras_from or PREDICTED}")
     print(f"seconds: {times}; peak memory {cost['peak_memory_mib']} MiB")
@@ -149,35 +144,24 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
 
 def _check(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     """Checks all arguments before weights are downloaded or any work is done."""
-    from vg2gt.io.video import require_pyav
-    from vg2gt.reconstruction.cameras import check_depth, check_pycolmap
+    from vg2gt.reconstruction.cameras import check_inputs
     from vg2gt.reconstruction.outputs import check_folder, check_outputs
-    from vg2gt.reconstruction.pictures import check_choice, check_pictures, existing_path
+    from vg2gt.reconstruction.pictures import check_limit
     from vg2gt.reconstruction.trust import check_trust
     from vg2gt.reconstruction.windows.capture import window_size
     from vg2gt.runs.load import backend_class
 
     check_outputs(options.save)
     check_folder(options.out, [*options.save, REFINED], options.overwrite)
-    check_choice(options.every, options.max_images)
+    check_limit(options.max_images)
     window_size(options.window, 0)
     check_trust(options.min_confidence, options.drop)
-    for item in options.images:
-        existing_path(item)
-    kind = backend_class(options.ckpt, overrides)
-    if getattr(kind, "needs_depth", False):
-        check_depth(kind.__name__, options.images)
-    check_pictures(options.images, options.skip_damaged)
-    if options.poses == "sfm" or (options.poses != "backbone" and getattr(kind, "needs_cameras", False)):
-        check_pycolmap(options.images, options.poses)
-    if "orbit.mp4" in options.save:
-        require_pyav("writing orbit.mp4")
+    check_inputs(backend_class(options.ckpt, overrides), options.images, options.poses)
 
 
 def _scene(options: argparse.Namespace, ready: LoadedModel, monitor: Monitor) -> Scene:
     """Makes a new scene, or adds images to the one in the folder, or removes some."""
-    from vg2gt.reconstruction.changes import add_images, take_out
-    from vg2gt.reconstruction.pipeline import reconstruct_with
+    from vg2gt.reconstruction.pipeline import add_images, reconstruct_with, take_out
     from vg2gt.reconstruction.windows.run import window_model
     from vg2gt.runs.load import find_calibration
 
@@ -190,15 +174,12 @@ def _scene(options: argparse.Namespace, ready: LoadedModel, monitor: Monitor) ->
     return reconstruct_with(
         ready.model,
         options.images,
-        every=options.every,
         max_images=options.max_images,
         size=options.size,
         renderer=renderer,
         monitor=monitor,
         poses=options.poses,
         sfm_folder=out / SFM,
-        frame=options.frame,
-        skip_damaged=options.skip_damaged,
         window=options.window,
         window_folder=out / WINDOWS,
         keep_windows=options.keep_windows,
@@ -218,21 +199,6 @@ def _refinement(scene: Scene, steps: int | None) -> RefineOptions | None:
     if steps is None:
         print(f"refining for {how.steps} steps, up to a minute on two cores; --refine 0 gives the feed-forward scene")
     return how
-
-
-def _figures(ready: LoadedModel) -> dict[str, Any]:
-    trained = bool(ready.model.trained_parameters())
-    return {
-        "model": type(ready.model).__name__,
-        "backend": ready.model.backend.identity(),
-        "weights": str(ready.weights) if trained else "none: the model has no trained part",
-    }
-
-
-def _steps(text: str) -> int:
-    if not text.isdigit():
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of steps; 0 disables refinement")
-    return int(text)
 
 
 def _size(text: str) -> int | tuple[int, int]:

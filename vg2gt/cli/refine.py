@@ -9,8 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vg2gt.cli.arguments import add_common_flags, add_trust_flags, flag_parser, listing, separate
-from vg2gt.cli.commands import COMMANDS
+from vg2gt.cli.arguments import add_common_flags, flag_parser, listing, separate
 from vg2gt.cli.errors import errors_in_one_line
 from vg2gt.reconstruction.output_names import DEFAULT, OUTPUTS, REFINED
 
@@ -24,14 +23,13 @@ ADVICE = "fewer or smaller images (vg2gt reconstruct --max-images, --size) or fe
 
 def parser() -> argparse.ArgumentParser:
     """The command's arguments."""
-    arguments = flag_parser("refine", COMMANDS["refine"], HOW + listing(OUTPUTS))
+    arguments = flag_parser("refine", HOW + listing(OUTPUTS))
     add = arguments.add_argument
     add("scene", metavar="DIR", help="a folder that vg2gt reconstruct has written")
     add("--out", metavar="DIR", help="where to write; default: refined/ in the scene's folder")
     add("--steps", type=int, metavar="N", help="number of steps; default: 12 per view, 400 for photos")
     add("--seconds", type=float, metavar="S", help="stop after S seconds, or after --steps if that comes first")
     add("--holdout", type=int, metavar="N", help="exclude every N-th view and print its PSNR before and after")
-    add_trust_flags(arguments)
     add_common_flags(arguments, DEFAULT)
     return arguments
 
@@ -50,14 +48,12 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     from vg2gt.memory import memory_advice
     from vg2gt.reconstruction.monitor import Monitor
     from vg2gt.reconstruction.outputs import check_folder, check_outputs, write_outputs
-    from vg2gt.reconstruction.refined import refine_scene
+    from vg2gt.reconstruction.refined import refine_scene, refinement_lines
     from vg2gt.reconstruction.saved import read_scene
-    from vg2gt.reconstruction.trust import check_trust, trusted
     from vg2gt.rendering import Renderer
     from vg2gt.runs.load import choose_device
 
     check_outputs(options.save)
-    check_trust(options.min_confidence, options.drop)
     out = Path(options.out or Path(options.scene) / "refined")
     check_folder(out, [*options.save, REFINED], options.overwrite)
     refine_options("default", overrides)  # reports wrong options before anything is read
@@ -67,18 +63,9 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
             scene = read_scene(options.scene, Renderer(mode=options.mode), device)
         how = options_for(scene, overrides, options.steps, options.seconds, options.holdout)
         scene = refine_scene(scene, how, monitor)
-        scene = trusted(scene, options.min_confidence, options.drop)
         folder = write_outputs(scene, out, options.save, overwrite=options.overwrite, monitor=monitor)
-    print_refinement(scene)
+    print(*refinement_lines(scene), sep="\n")
     print(f"written: {', '.join(str(folder / name) for name in (*options.save, REFINED))}")
-
-
-def print_refinement(scene: Scene) -> None:
-    """Prints the result of a refinement."""
-    from vg2gt.reconstruction.refined import refinement_lines
-
-    assert scene.refined is not None
-    print("\n".join(refinement_lines(scene.refined)))
 
 
 def options_for(
@@ -99,24 +86,16 @@ def options_for(
     found = refine_options(refinement_of(scene), overrides)
     if not overrides and not scene.cameras_from:
         found = replace(found, rates=replace(found.rates, cameras=RefineRates().cameras))
-    if seconds is not None:
-        found = replace(found, seconds=seconds, steps=steps)
-    elif steps is not None:
-        found = replace(found, steps=steps)
+    if seconds is not None or steps is not None:
+        found = replace(found, steps=steps, seconds=found.seconds if seconds is None else seconds)
     return found if holdout is None else replace(found, holdout=holdout)
 
 
 def refine_options(name: str, overrides: Sequence[str]) -> RefineOptions:
     """Builds the options of ``refine=NAME refine.key=value``; ``name`` is used if the overrides choose none."""
-    from hydra.errors import InstantiationException
     from hydra.utils import instantiate
 
     from vg2gt.config import compose_groups
 
     chosen = any(override.startswith("refine=") for override in overrides)
-    try:
-        return instantiate(compose_groups(*([] if chosen else [f"refine={name}"]), *overrides).refine)
-    except InstantiationException as error:
-        if not isinstance(error.__cause__, ValueError):
-            raise
-        raise error.__cause__ from error
+    return instantiate(compose_groups(*([] if chosen else [f"refine={name}"]), *overrides).refine)

@@ -6,7 +6,6 @@ import argparse
 from collections.abc import Sequence
 
 from vg2gt.cli.arguments import add_common_flags, flag_parser, listing
-from vg2gt.cli.commands import COMMANDS
 from vg2gt.cli.errors import errors_in_one_line
 from vg2gt.reconstruction.output_names import FPS, MAPS
 
@@ -16,7 +15,7 @@ DEFAULT = ("color.png",)
 
 def parser() -> argparse.ArgumentParser:
     """The command's arguments."""
-    arguments = flag_parser("render", COMMANDS["render"], listing(OUTPUTS))
+    arguments = flag_parser("render", listing(OUTPUTS))
     add = arguments.add_argument
     add("scene", help="scene.ply or .spz")
     add(
@@ -45,11 +44,9 @@ def run(options: argparse.Namespace) -> None:
     """Renders the views and writes the outputs."""
     from vg2gt.io import read_gaussians
     from vg2gt.io.video import require_pyav
-    from vg2gt.reconstruction.camera_files import read_cameras
-    from vg2gt.reconstruction.camera_paths import interpolate
-    from vg2gt.reconstruction.maps import animation, feed, map_sinks
+    from vg2gt.reconstruction.camera_files import interpolate, read_cameras
     from vg2gt.reconstruction.monitor import Monitor
-    from vg2gt.reconstruction.outputs import check_outputs, cost_figures, prepare_folder
+    from vg2gt.reconstruction.outputs import animation, check_folder, check_outputs, cost_figures, feed, map_folder
     from vg2gt.reconstruction.scene import render_views
     from vg2gt.rendering import Renderer
     from vg2gt.runs.load import choose_device
@@ -66,8 +63,9 @@ def run(options: argparse.Namespace) -> None:
     if not len(gaussians):
         raise ValueError(f"{options.scene} holds no Gaussians; there is nothing to render")
     renderer = Renderer(mode=options.mode, depth=options.depth, near=options.near)
-    folder = prepare_folder(options.out, outputs, options.overwrite)
-    sinks = map_sinks(folder, outputs)
+    folder = check_folder(options.out, outputs, options.overwrite)
+    folder.mkdir(parents=True, exist_ok=True)
+    sinks = [map_folder(folder, name) for name in outputs if name in MAPS]
     sinks += [animation(folder / name, options.fps) for name in outputs if name.startswith("video")]
     monitor = Monitor(show=not options.quiet, device=gaussians.means.device)
     with monitor, monitor.stage("render views", len(cameras)) as advance:

@@ -3,11 +3,10 @@
 from omegaconf import DictConfig
 
 from vg2gt.cli.arguments import hydra_command
-from vg2gt.cli.commands import COMMANDS
 from vg2gt.cli.errors import refuse_ranks_in_a_sweep
 
 
-@hydra_command(COMMANDS["train"], "train")
+@hydra_command("train")
 def main(config: DictConfig) -> None:
     """Runs the training that the configuration describes."""
     from vg2gt.training.loop import train

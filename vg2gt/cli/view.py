@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vg2gt.cli.arguments import flag_parser
-from vg2gt.cli.commands import COMMANDS
 from vg2gt.cli.errors import errors_in_one_line
 
 if TYPE_CHECKING:
@@ -53,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = flag_parser("view", COMMANDS["view"])
+    parser = flag_parser("view")
     add = parser.add_argument
     add("scene", type=Path, help="scene.ply or .spz")
     add("--cameras", type=Path, help="cameras, the first is the initial view; default: cameras.json next to the scene")

@@ -1,12 +1,16 @@
-"""Reads cameras to render from common files: our cameras.json, that of 3DGS, transforms.json, a COLMAP model."""
+"""Cameras to render: read from cameras.json, transforms.json or a COLMAP model, and smooth paths through them."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
 
+from vg2gt.data.sources.parsing import IMAGE_SUFFIXES
 from vg2gt.data.sources.undistortion import pinhole_camera
 from vg2gt.io import colmap_images, colmap_intrinsics, colmap_pose, read_cameras_json, read_colmap, read_transforms
 from vg2gt.io.cameras_json import NamedCamera, invert_pose
@@ -66,20 +70,60 @@ def _of_transforms(path: Path) -> list[NamedCamera]:
 
 
 def _of_3dgs(place: str, entry: Any) -> NamedCamera:
-    """Converts an entry of 3DGS's ``cameras.json``: centre, camera-to-world rotation, focal lengths.
-
-    It has no principal point; the image centre is used.
-    """
+    """Converts an entry of 3DGS's ``cameras.json``, which has no principal point: the image centre is used."""
     try:
-        to_world = np.eye(4)
-        to_world[:3, :3] = np.asarray(entry["rotation"], np.float64)
-        to_world[:3, 3] = np.asarray(entry["position"], np.float64)
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = entry["rotation"], entry["position"]  # camera to world
         width, height = int(entry["width"]), int(entry["height"])
-        fx, fy = float(entry["fx"]), float(entry["fy"])
-        name = str(entry["img_name"])
+        fx, fy, name = float(entry["fx"]), float(entry["fy"]), str(entry["img_name"])
     except (KeyError, TypeError, ValueError) as error:
         raise FormatError(f"{place}: not a camera of 3D Gaussian Splatting ({error!r})") from error
-    if not (np.isfinite(to_world).all() and min(width, height) > 0 and min(fx, fy) > 0):
+    if not (np.isfinite(pose).all() and min(width, height) > 0 and min(fx, fy) > 0):
         raise FormatError(f"{place}: values that are not finite, or no positive size and focal length")
     matrix = np.array([[fx, 0, (width - 1) / 2], [0, fy, (height - 1) / 2], [0, 0, 1]])
-    return NamedCamera(name, width, height, matrix, invert_pose(to_world))
+    return NamedCamera(name, width, height, matrix, invert_pose(pose))
+
+
+def interpolate(cameras: Sequence[NamedCamera], between: int) -> list[NamedCamera]:
+    """Returns a smooth path through given cameras: splines of position and rotation, linear intrinsics.
+
+    Args:
+        cameras: at least two, of one image size; all are on the path.
+        between: number of new cameras between neighbouring ones.
+
+    Returns:
+        The path, ``(n - 1) * (between + 1) + 1`` cameras.
+
+    Raises:
+        ValueError: if there are fewer than two cameras, their sizes differ, or ``between`` is negative.
+    """
+    if len(cameras) < 2 or between < 0:
+        raise ValueError(f"a path needs at least two cameras and 0 or more between them, got {len(cameras)}, {between}")
+    sizes = {(camera.width, camera.height) for camera in cameras}
+    if len(sizes) > 1:
+        raise ValueError(f"cameras of one image size are needed, these have {sorted(sizes)}; choose some of one size")
+    times = np.arange(len(cameras), dtype=np.float64)
+    poses = np.stack([invert_pose(camera.world_to_camera) for camera in cameras])
+    positions = CubicSpline(times, poses[:, :3, 3], bc_type="natural")
+    rotations = RotationSpline(times, Rotation.from_matrix(poses[:, :3, :3]))
+    intrinsics = np.stack([camera.intrinsics for camera in cameras])
+    path = []
+    for number in range((len(cameras) - 1) * (between + 1) + 1):
+        left, step = divmod(number, between + 1)
+        if step == 0:  # exactly the given camera, free of spline rounding
+            path.append(cameras[left])
+            continue
+        time = left + step / (between + 1)
+        pose = np.eye(4)
+        pose[:3, :3] = rotations(time).as_matrix()
+        pose[:3, 3] = positions(time)
+        share = time - left
+        k = (1 - share) * intrinsics[left] + share * intrinsics[left + 1]
+        name = f"{view_stem(cameras[left].name)}-{step:03d}"
+        path.append(NamedCamera(name, cameras[0].width, cameras[0].height, k, invert_pose(pose)))
+    return path
+
+
+def view_stem(name: str) -> str:
+    """Returns a view's name without an image file extension; other dots are part of the name."""
+    return name[: -len(suffix)] if (suffix := Path(name).suffix).lower() in IMAGE_SUFFIXES else name

@@ -15,13 +15,20 @@ from vg2gt.io.files import by_number
 from vg2gt.model import Reconstructor
 from vg2gt.reconstruction.given_cameras import LAYOUTS, describe, given_pictures
 from vg2gt.reconstruction.monitor import Monitor
-from vg2gt.reconstruction.pictures import ImagesLike, Picture, find_pictures, report_damaged, undamaged
+from vg2gt.reconstruction.pictures import (
+    ImagesLike,
+    Picture,
+    as_items,
+    check_pictures,
+    existing_path,
+    find_pictures,
+    without_copies,
+)
 from vg2gt.reconstruction.sfm import find_cameras, require_pycolmap
-from vg2gt.reconstruction.sound import without_copies
 
 log = logging.getLogger(__name__)
 
-Poses = Literal["auto", "given", "sfm", "backbone"]
+Poses = Literal["auto", "given", "sfm"]
 
 
 @contextmanager
@@ -30,11 +37,9 @@ def pictures_for(
     images: ImagesLike,
     poses: Poses = "auto",
     *,
-    every: int = 1,
     max_images: int | None = None,
     sfm_folder: Path | None = None,
     monitor: Monitor | None = None,
-    skip_damaged: bool = False,
 ) -> Iterator[list[Picture]]:
     """Yields the pictures to reconstruct, with cameras if the backbone takes any; they can be read inside the block.
 
@@ -43,13 +48,11 @@ def pictures_for(
         images: see :func:`vg2gt.reconstruction.pictures.find_pictures`.
         poses: ``auto``: a backbone that needs cameras gets those next to the images
             (:func:`~vg2gt.reconstruction.given_cameras.given_pictures`), else those of structure from motion
-            (:func:`~vg2gt.reconstruction.sfm.find_cameras`); other backbones predict their own. ``given``, ``sfm``
-            and ``backbone`` allow only that source.
-        every: take only every N-th picture.
+            (:func:`~vg2gt.reconstruction.sfm.find_cameras`); other backbones predict their own. ``given`` and ``sfm``
+            allow only that source.
         max_images: maximum number of pictures, evenly spread.
         sfm_folder: folder for the result of structure from motion; None: a temporary one.
         monitor: shows and times the stages.
-        skip_damaged: skip photographs that cannot be read, with a warning that names them.
 
     Yields:
         The pictures; of identical files, only the first.
@@ -62,20 +65,17 @@ def pictures_for(
     backend = model.backend
     _check(model, poses)
     if not backend.needs_hints:
-        yield without_copies(find_pictures(images, every, max_images, skip_damaged))
+        yield without_copies(find_pictures(images, max_images))
         return
     given = None
     if poses != "sfm":
         try:
-            given = given_pictures(images, every, max_images, depth=backend.needs_depth)
+            given = given_pictures(images, max_images, depth=backend.needs_depth)
         except DataError as error:
             if poses == "given" or backend.needs_depth:
                 raise
             log.warning("cannot use the camera files, running structure from motion instead: %s", error)
     if given is not None:
-        damaged: list[str] = []
-        given = undamaged(given, damaged) if skip_damaged else given
-        report_damaged(damaged, skip=True)
         yield without_copies(given)
         return
     if backend.needs_depth:
@@ -85,45 +85,34 @@ def pictures_for(
             f"no cameras next to {describe(images)}: expected {LAYOUTS}; --poses sfm finds them from the images"
         )
     with tempfile.TemporaryDirectory(prefix="vg2gt-sfm-") as temporary:
-        pictures = without_copies(find_pictures(images, every, max_images, skip_damaged))
-        yield _found(pictures, sfm_folder or Path(temporary) / "sfm", monitor or Monitor())
+        pictures = without_copies(find_pictures(images, max_images))
+        place = {picture.name: number for number, picture in enumerate(pictures)}
+        if all(picture.path is not None for picture in pictures):  # so that the order of the files does not matter
+            pictures = sorted(pictures, key=lambda picture: by_number(str(picture.path)))
+        found = find_cameras(pictures, sfm_folder or Path(temporary) / "sfm", monitor or Monitor())
+        yield sorted(found, key=lambda picture: place[picture.name])
 
 
-def _found(pictures: list[Picture], folder: Path, monitor: Monitor) -> list[Picture]:
-    """Finds cameras by structure from motion; files are sorted by name, so that the input order does not matter."""
-    if any(picture.path is None for picture in pictures):
-        return find_cameras(pictures, folder, monitor)
-    ordered = sorted(pictures, key=lambda picture: by_number(str(picture.path)))
-    place = {picture.name: number for number, picture in enumerate(pictures)}
-    return sorted(find_cameras(ordered, folder, monitor), key=lambda picture: place[picture.name])
-
-
-def check_depth(backend: str, images: ImagesLike) -> None:
-    """Checks, before anything is built, that images have the depth that a backend needs.
+def check_inputs(backend: type, images: ImagesLike, poses: Poses) -> None:
+    """Checks the images, before anything is built: that they can be read, and have or can get what a backend needs.
 
     Args:
-        backend: name of the backend, for the message.
-        images: input of the reconstruction.
-
-    Raises:
-        FileNotFoundError: if a path does not exist.
-        ValueError: if the depth is missing.
-    """
-    if given_pictures(images, depth=True) is None:
-        raise ValueError(_no_depth(backend, images))
-
-
-def check_pycolmap(images: ImagesLike, poses: Poses) -> None:
-    """Checks, before anything is built, that pycolmap is installed if finding the images' cameras needs it.
-
-    Args:
+        backend: class of the backend.
         images: input of the reconstruction.
         poses: see :func:`pictures_for`.
 
     Raises:
-        ImportError: if it is not installed; the message says what needs it and how to install it.
+        FileNotFoundError: if a path does not exist.
+        ImportError: if a package is not installed; the message says what needs it and how to install it.
+        ValueError: if there are no pictures, or they lack depth.
     """
-    if importlib.util.find_spec("pycolmap") is None and (poses == "sfm" or given_pictures(images) is None):
+    for item in as_items(images):
+        existing_path(item)
+    if getattr(backend, "needs_depth", False) and given_pictures(images, depth=True) is None:
+        raise ValueError(_no_depth(backend.__name__, images))
+    check_pictures(images)
+    needed = poses == "sfm" or getattr(backend, "needs_cameras", False)
+    if needed and importlib.util.find_spec("pycolmap") is None and (poses == "sfm" or given_pictures(images) is None):
         require_pycolmap()
 
 
@@ -139,8 +128,6 @@ def _check(model: Reconstructor, poses: str) -> None:
     backend = model.backend
     if poses not in get_args(Poses):
         raise ValueError(f"poses is {poses!r}; choose one of {', '.join(get_args(Poses))}")
-    if poses == "backbone" and backend.needs_hints:
-        raise ValueError(f"backend {backend.name} predicts no cameras; take --poses auto, given or sfm")
     if poses in ("given", "sfm") and not backend.needs_hints:
         raise ValueError(
             f"backend {backend.name} predicts its own cameras and accepts none: omit --poses, or use a backend that "

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import shutil
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,10 +15,12 @@ from numpy.typing import NDArray
 from vg2gt.data.base import DataError
 from vg2gt.geometry.cameras import project
 from vg2gt.io.files import write_bytes
+from vg2gt.io.image_files import orientation
 from vg2gt.io.images import encode_image, to_pixels
 from vg2gt.types import Cameras
 
 if TYPE_CHECKING:
+    from vg2gt.reconstruction.pictures import Picture
     from vg2gt.reconstruction.scene import Scene
 
 log = logging.getLogger(__name__)
@@ -37,19 +38,29 @@ class ExportedViews:
         cameras: ``[1, V]`` float64; ``size`` is that of the first view.
         sizes: ``(height, width)`` of each view.
         names: unique file names.
-        writers: functions that write the image of a view to a path.
+        pictures: source picture of each view; None: its image at the working size is exported.
     """
 
     cameras: Cameras
     sizes: tuple[tuple[int, int], ...]
     names: tuple[str, ...]
-    writers: tuple[Callable[[Path], None], ...]
+    pictures: tuple[Picture | None, ...]
 
-    def write_images(self, folder: Path) -> None:
-        """Writes all images."""
-        for name, write in zip(self.names, self.writers, strict=True):
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            write(folder / name)
+    def write_images(self, scene: Scene, folder: Path) -> None:
+        """Writes the images of a scene's views; photographs that need no change are copied."""
+        folder.mkdir(parents=True)
+        for name, picture, image in zip(self.names, self.pictures, scene.images, strict=True):
+            path = folder / name
+            suffix = path.suffix.lower()
+            if picture is not None:
+                file = None if picture.lens else picture.path
+                if file is not None and file.suffix.lower() == suffix and _is_upright(file):
+                    shutil.copyfile(file, path)
+                    continue
+                image = picture.read(picture.size).images[0]
+            kind = "JPEG" if suffix in (".jpg", ".jpeg") else "PNG"
+            options = {"quality": _QUALITY, "subsampling": 0} if kind == "JPEG" else {}
+            write_bytes(path, encode_image(to_pixels(image), kind, **options))
 
     def observations(self, scene: Scene) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
         """Returns which views see the scene's points, and where: points ``[T]``, views ``[T]``, pixels ``[T, 2]``.
@@ -83,13 +94,13 @@ class ExportedViews:
         return directions * after[[0, 1], [0, 1]] + after[:2, 2]
 
 
-def exported_views(scene: Scene, whole: bool) -> ExportedViews:
-    """Returns the views with whole photographs if known and wanted, else with the images at the working size."""
+def exported_views(scene: Scene) -> ExportedViews:
+    """Returns the views with whole photographs if known, else with the images at the working size."""
     named = scene.named_cameras()
     poses = torch.from_numpy(np.stack([camera.world_to_camera for camera in named]))
     small = [(camera.height, camera.width) for camera in named]
-    photos = [camera.photo for camera in named] if whole else [None] * len(named)
-    if whole and None in photos:
+    photos = [camera.photo for camera in named]
+    if None in photos:
         log.warning("photographs of a scene read from a folder are not known: images are exported at the working size")
     sizes = tuple((p.height, p.width) if p is not None else s for p, s in zip(photos, small, strict=True))
     matrices = np.stack([c.intrinsics if p is None else p.intrinsics for c, p in zip(named, photos, strict=True)])
@@ -97,32 +108,11 @@ def exported_views(scene: Scene, whole: bool) -> ExportedViews:
     if len({name.lower() for name in names}) < len(names):  # photographs of several folders
         names = [f"{camera.name[:-4]}{Path(name).suffix}" for camera, name in zip(named, names, strict=True)]
     cameras = Cameras(poses[None], torch.from_numpy(matrices)[None], sizes[0])
-    writers = tuple(_writer(scene, view, photos[view] is not None) for view in range(len(named)))
-    return ExportedViews(cameras, sizes, tuple(names), writers)
-
-
-def _writer(scene: Scene, view: int, whole: bool) -> Callable[[Path], None]:
-    picture = scene.pictures[view] if whole else None
-
-    def write(path: Path) -> None:
-        """Writes the view's image."""
-        image = scene.images[view]
-        if picture is not None:
-            same = picture.path is not None and not picture.lens and picture.path.suffix.lower() == path.suffix.lower()
-            if same and picture.path is not None and _is_upright(picture.path):
-                shutil.copyfile(picture.path, path)
-                return
-            image = picture.read(picture.size).images[0]
-        kind = {".jpg": "JPEG", ".jpeg": "JPEG"}.get(path.suffix.lower(), "PNG")
-        options = {"quality": _QUALITY, "subsampling": 0} if kind == "JPEG" else {}
-        write_bytes(path, encode_image(to_pixels(image), kind, **options))
-
-    return write
+    pictures = tuple(None if photo is None else scene.pictures[view] for view, photo in enumerate(photos))
+    return ExportedViews(cameras, sizes, tuple(names), pictures)
 
 
 def _is_upright(path: Path) -> bool:
-    from vg2gt.io.image_files import orientation
-
     try:
         return orientation(path, "") == 1
     except DataError:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -18,7 +17,6 @@ from vg2gt.types import Cameras, Gaussians
 
 log = logging.getLogger(__name__)
 
-FrameName = Literal["auto", "given", "first", "upright"]
 FAR = 1e4  # distance from the origin, in depths, at which float32 resolves about a thousandth of a depth
 SAME = 1e-4  # of the extent: cameras that differ less from the given ones are replaced by them
 _LEVEL = 0.2  # minimum length of the cameras' mean down vector for it to define gravity
@@ -29,66 +27,44 @@ class SceneFrame:
     """Placement of a scene's world in the world of its source cameras.
 
     Attributes:
-        name: ``reference`` (camera of the view that the model processed first, median depth about 1), ``first``
-            (camera of the first image), ``upright`` (reference rotated until y points along gravity) or ``given``.
+        name: ``reference`` (camera of the view that the model processed first, median depth about 1), ``upright``
+            (reference rotated until y points along gravity) or ``given``.
         to_source: ``[4, 4]`` float64 similarity from the scene's world to that of the cameras as given, found or
             predicted; its scale is source units per scene unit.
         poses: ``[V, 4, 4]`` float64 ``world_to_camera`` as given or found; None if the backbone predicted them.
-        source: ``given``, ``found`` or ``predicted``.
-        wanted: frame to write the scene in; ``auto``: ``given`` if cameras were given, else ``upright``.
+        target: frame to write the scene in: ``given`` if cameras were given, else ``upright``.
     """
 
     name: str
     to_source: NDArray[np.float64]
     poses: NDArray[np.float64] | None = None
-    source: str = "predicted"
-    wanted: FrameName = "auto"
+    target: str = "upright"
 
     @property
     def scale(self) -> float:
         """Source units per scene unit."""
         return float(np.cbrt(np.linalg.det(self.to_source[:3, :3])))
 
-    @property
-    def target(self) -> str:
-        """The frame to write the scene in, with ``auto`` resolved."""
-        if self.wanted != "auto":
-            return self.wanted
-        return "given" if self.source == "given" else "upright"
 
-
-def check_frame(wanted: str, source: str | None = None) -> None:
-    """Checks the name of a frame, and that cameras are given if ``given`` is wanted.
-
-    Raises:
-        ValueError: if the name is unknown, or no cameras are given.
-    """
-    if wanted not in get_args(FrameName):
-        raise ValueError(f"frame is {wanted!r}; choose one of {', '.join(get_args(FrameName))}")
-    if wanted == "given" and source not in (None, "given"):
-        raise ValueError("no cameras are given, so --frame given is not possible: use --frame upright or first")
-
-
-def first_frame(
-    cameras: Cameras, unit: float, poses: NDArray[np.float64] | None, source: str, wanted: FrameName
-) -> SceneFrame:
+def first_frame(cameras: Cameras, unit: float, poses: NDArray[np.float64] | None, target: str) -> SceneFrame:
     """Returns the frame of a new scene, whose world is the camera of one of its views.
 
     Args:
         cameras: cameras of the scene (B = 1).
         unit: scene units per source unit; used if ``poses`` is None or the cameras do not move.
         poses: ``[V, 4, 4]`` poses of the cameras as given or found; None if predicted.
-        source: ``given``, ``found`` or ``predicted``.
-        wanted: see :class:`SceneFrame`.
+        target: see :class:`SceneFrame`.
     """
     scaled = np.diag([1 / unit, 1 / unit, 1 / unit, 1.0])
     if poses is None:
-        return SceneFrame("reference", scaled, None, source, wanted)
+        return SceneFrame("reference", scaled, None, target)
     own = replace(cameras, world_to_camera=cameras.world_to_camera.detach().cpu().double())
     given = replace(own, world_to_camera=torch.from_numpy(poses)[None])
-    return SceneFrame(
-        "reference", _matrix(align_cameras(own, given, lambda: torch.tensor([1 / unit]))), poses, source, wanted
-    )
+    move = align_cameras(own, given, lambda: torch.tensor([1 / unit]))
+    matrix = np.eye(4)
+    matrix[:3, :3] = float(move.scale[0]) * move.rotation[0].double().numpy()
+    matrix[:3, 3] = move.translation[0].double().numpy()
+    return SceneFrame("reference", matrix, poses, target)
 
 
 def move_to_target(frame: SceneFrame, cameras: Cameras, depth: float) -> tuple[SceneFrame, Similarity]:
@@ -102,9 +78,7 @@ def move_to_target(frame: SceneFrame, cameras: Cameras, depth: float) -> tuple[S
     move = np.eye(4)
     if frame.target == "given":
         move = _near_origin(frame.to_source.copy(), frame.scale * depth)
-    elif frame.target == "first":
-        move = cameras.world_to_camera[0, 0].detach().cpu().double().numpy()
-    elif frame.target == "upright":
+    else:
         move[:3, :3] = upright_rotation(cameras.world_to_camera[0].detach().cpu().double().numpy())
     return replace(frame, name=frame.target, to_source=frame.to_source @ np.linalg.inv(move)), similarity_of(move)
 
@@ -169,18 +143,11 @@ def _near_origin(move: NDArray[np.float64], depth: float) -> NDArray[np.float64]
         offset = move[:3, 3].round()
         log.warning(
             "the given cameras are %.3g scene depths from their origin, too far for single precision: the scene is "
-            "written shifted by %s; report.json and cameras.json contain the similarity transform to the given frame",
+            "written shifted by %s; cameras.json contains the similarity transform to the given frame",
             far / depth, (-offset).tolist(),
         )  # fmt: skip
         move[:3, 3] -= offset
     return move
-
-
-def _matrix(similarity: Similarity) -> NDArray[np.float64]:
-    matrix = np.eye(4)
-    matrix[:3, :3] = float(similarity.scale[0]) * similarity.rotation[0].double().numpy()
-    matrix[:3, 3] = similarity.translation[0].double().numpy()
-    return matrix
 
 
 def similarity_of(matrix: NDArray[np.float64]) -> Similarity:

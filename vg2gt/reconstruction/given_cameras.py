@@ -28,7 +28,7 @@ from vg2gt.reconstruction.pictures import (
     ImagesLike,
     Picture,
     as_items,
-    check_choice,
+    check_limit,
     evenly,
     existing_path,
     frame_of,
@@ -46,9 +46,7 @@ _CAMERAS, _TRANSFORMS = "cameras.json", "transforms.json"
 LAYOUTS = f"{_CAMERAS}, {_TRANSFORMS}, a COLMAP model in sparse/0, or poses.txt with K.txt"
 
 
-def given_pictures(
-    images: ImagesLike, every: int = 1, max_images: int | None = None, depth: bool = False
-) -> list[Picture] | None:
+def given_pictures(images: ImagesLike, max_images: int | None = None, depth: bool = False) -> list[Picture] | None:
     """Lists the pictures whose cameras are in files next to them.
 
     The search order is ``cameras.json``, ``transforms.json`` (or Blender's ``transforms_train.json``), a COLMAP model,
@@ -57,7 +55,6 @@ def given_pictures(
 
     Args:
         images: a folder, image files, an ``.r3d`` file, or a sequence of these.
-        every: take only every N-th picture.
         max_images: maximum number of pictures, evenly spread; None: all.
         depth: require depth too, and ignore cameras without it.
 
@@ -69,7 +66,7 @@ def given_pictures(
         ImportError: if pycolmap is needed and not installed.
         ValueError: if a file of cameras is damaged, or belongs to other images.
     """
-    check_choice(every, max_images)
+    check_limit(max_images)
     items = as_items(images)
     if not all(isinstance(item, (str, Path)) for item in items):
         return None
@@ -80,7 +77,7 @@ def given_pictures(
         if own is None:
             return None
         found += own if files is None else _only(own, files, folder)
-    return with_unique_names(evenly(found[::every], max_images))
+    return with_unique_names(evenly(found, max_images))
 
 
 def recording_pictures(source: FileSource) -> list[Picture]:
@@ -145,8 +142,12 @@ def _only(pictures: list[Picture], files: list[Path], folder: Path) -> list[Pict
 
 def _given(folder: Path, depth: bool) -> list[Picture] | None:
     for place, images, sure in _places(folder):
+        pictures = None
         try:
-            pictures = _pictures_of(place, images, depth)
+            if not depth and (place / _CAMERAS).is_file():
+                pictures = _from_cameras_json(place / _CAMERAS, place / images)
+            if pictures is None and (source := _source(place, images, depth)) is not None:
+                pictures = recording_pictures(source)
         except DataError as error:
             if sure:
                 raise
@@ -167,15 +168,6 @@ def _places(folder: Path) -> Iterator[tuple[Path, str, bool]]:
     above = folder.resolve().parent
     if folder.is_dir():
         yield above, folder.resolve().name, is_image_folder(folder.name)
-
-
-def _pictures_of(place: Path, images: str, depth: bool) -> list[Picture] | None:
-    if not depth and (place / _CAMERAS).is_file():
-        pictures = _from_cameras_json(place / _CAMERAS, place / images)
-        if pictures is not None:
-            return pictures
-    source = _source(place, images, depth)
-    return None if source is None else recording_pictures(source)
 
 
 def _source(folder: Path, images: str, depth: bool) -> FileSource | None:
@@ -199,11 +191,9 @@ def _source(folder: Path, images: str, depth: bool) -> FileSource | None:
 def _name_missing(pictures: list[Picture], folder: Path) -> None:
     """Warns about images of a folder that have no camera."""
     known = {picture.path.resolve() for picture in pictures if picture.path is not None}
-    if not folder.is_dir() or not all(path.suffix.lower() != ".r3d" for path in known):
-        return
     try:
         files = image_files(folder)
-    except ValueError:
+    except (ValueError, OSError):  # the pictures are elsewhere, such as in an archive
         return
     if any(file.resolve() in known for file in files):
         _name_left_out([file.name for file in files if file.resolve() not in known], pictures[0].source)

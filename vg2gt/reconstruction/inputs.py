@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import math
 from collections.abc import Sequence
@@ -10,19 +11,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from vg2gt.data.base import Frames
-from vg2gt.data.transforms import resize_to_cover
+from vg2gt.data.transforms import resize_to_cover, to_bytes
 from vg2gt.geometry.cameras import crop_intrinsics, resize_intrinsics
 from vg2gt.io.cameras_json import NamedCamera, Photo
 from vg2gt.reconstruction.monitor import Monitor
-from vg2gt.reconstruction.pictures import Picture, decoded
-from vg2gt.types import Cameras, Hints
+from vg2gt.reconstruction.pictures import Picture
+from vg2gt.types import Cameras, Geometry, Hints
 
 log = logging.getLogger(__name__)
 
 LONGER_SIDE = {"cuda": 518, "cpu": 280}  # pixels, by device; foundation models are trained at about 518
-_MUCH_LOST = 0.25
+_THUMBNAIL = 24  # pixels per side
+_LEAST_KEPT = 0.75  # share of a picture's area; cropping more is warned about
 _FEWEST_POINTS = 20  # minimum observations of sparse points for a depth range
 _OUTLIERS, _NEARER, _FARTHER = 1, 0.8, 1.4  # percent cut at either end, widening factors
 
@@ -34,7 +37,6 @@ class Views:
     Attributes:
         images: ``[V, 3, H, W]`` float32 in [0, 1], on the CPU.
         names: one per view, unique.
-        kept: share of each picture's area that is left after cropping.
         hints: known inputs, on the CPU: at least the order of the pictures.
         mask: ``[V, H, W]`` float32 in [0, 1], pixel weights (alpha, mask images); None: all pixels count.
         pictures: source pictures, one per view.
@@ -42,7 +44,6 @@ class Views:
 
     images: Tensor
     names: tuple[str, ...]
-    kept: tuple[float, ...]
     hints: Hints
     mask: Tensor | None = None
     pictures: tuple[Picture, ...] = ()
@@ -87,11 +88,11 @@ def load_views(pictures: Sequence[Picture], size: tuple[int, int], monitor: Moni
     """
     frames: list[Frames] = []
     with monitor.stage("load images", len(pictures)) as advance:
-        for number in range(len(pictures)):
-            frames.append(resize_to_cover(decoded(pictures, number, size), size))
+        for picture in pictures:
+            frames.append(resize_to_cover(picture.read(size), size))
             advance()
-    kept = tuple(_kept(picture.size, size) for picture in pictures)
-    much = [picture.name for picture, share in zip(pictures, kept, strict=True) if share < 1 - _MUCH_LOST]
+    ratios = [(p.size[0] / p.size[1]) / (size[0] / size[1]) for p in pictures]
+    much = [p.name for p, ratio in zip(pictures, ratios, strict=True) if min(ratio, 1 / ratio) < _LEAST_KEPT]
     if much:
         log.warning(
             "%d of %d images have a different aspect ratio than %dx%d and lose more than a quarter to cropping (first: "
@@ -100,9 +101,13 @@ def load_views(pictures: Sequence[Picture], size: tuple[int, int], monitor: Moni
         )  # fmt: skip
     joined = Frames.concatenate(frames)
     mask = None if joined.mask is None else joined.mask[None]
-    hints = replace(_hints(pictures, joined, size), mask=mask)
+    source, hints = source_of(pictures), Hints(frame_ids=torch.arange(len(pictures))[None], mask=mask)
+    if source:
+        cameras = Cameras(given_poses(pictures)[None], joined.intrinsics[None], size)
+        depth = joined.depth[None] if all(picture.has_depth for picture in pictures) else None
+        hints = Hints(depth, cameras, (source,), hints.frame_ids, depth_range(pictures), mask)
     names = tuple(picture.name for picture in pictures)
-    return Views(joined.images, names, kept, hints, joined.mask, tuple(pictures))
+    return Views(joined.images, names, hints, joined.mask, tuple(pictures))
 
 
 def photo_of(camera: NamedCamera, picture: Picture) -> Photo:
@@ -117,22 +122,6 @@ def photo_of(camera: NamedCamera, picture: Picture) -> Photo:
     matrix = crop_intrinsics(torch.from_numpy(camera.intrinsics), -room[1], -room[0])
     matrix = resize_intrinsics(matrix, width / covering[1], height / covering[0])
     return Photo(name, width, height, matrix.numpy(), picture.lens)
-
-
-def _kept(size: tuple[int, int], window: tuple[int, int]) -> float:
-    ratio = (size[0] / size[1]) / (window[0] / window[1])
-    return min(ratio, 1 / ratio)
-
-
-def _hints(pictures: Sequence[Picture], frames: Frames, size: tuple[int, int]) -> Hints:
-    """Returns the order of the pictures and, if all are from one recording, its cameras and depth."""
-    source, order = source_of(pictures), torch.arange(len(pictures))[None]
-    if not source:
-        return Hints(frame_ids=order)
-    has_depth = all(picture.has_depth for picture in pictures)
-    cameras = Cameras(given_poses(pictures)[None], frames.intrinsics[None], size)
-    depth = frames.depth[None] if has_depth else None
-    return Hints(depth, cameras, (source,), order, depth_range(pictures))
 
 
 def source_of(pictures: Sequence[Picture]) -> str:
@@ -170,3 +159,39 @@ def depth_range(pictures: Sequence[Picture]) -> Tensor | None:
         return None
     near, far = np.percentile(depths, (_OUTLIERS, 100 - _OUTLIERS))
     return torch.tensor([[near * _NEARER, far * _FARTHER]], dtype=torch.float32)
+
+
+def working_order(images: Tensor) -> list[int]:
+    """Returns the indices of views ``[V, 3, H, W]`` in processing order.
+
+    The first view defines the scene's frame: it is the one that looks most like the others, by the correlation of
+    thumbnails. The others are sorted by a hash of their contents.
+    """
+    contents = [hashlib.sha256(to_bytes(image).numpy().tobytes()).hexdigest() for image in images]
+    order = sorted(range(len(contents)), key=lambda view: contents[view])
+    unit = thumbnails(images)[order]
+    reference = int((unit @ unit.mean(0)).argmax())
+    return [order[reference], *(view for place, view in enumerate(order) if place != reference)]
+
+
+def thumbnails(images: Tensor) -> Tensor:
+    """Returns small grey images ``[V, 576]`` of zero mean and unit length, float64: their products are correlations."""
+    gray = (image[None].mean(1, keepdim=True) for image in images)  # one by one, to bound memory
+    small = torch.cat([F.interpolate(image, (_THUMBNAIL, _THUMBNAIL), mode="area").flatten(1) for image in gray])
+    return F.normalize(small.double() - small.double().mean(1, keepdim=True), dim=1)
+
+
+def in_order(views: Views, order: Sequence[int]) -> tuple[Tensor, Hints]:
+    """Returns images ``[V, 3, H, W]`` and hints of the views in another order."""
+    hints = views.hints
+    cameras = None if hints.cameras is None else hints.cameras.select(torch.tensor(order))
+    parts = {name: getattr(hints, name) for name in ("depth", "frame_ids", "mask")}
+    chosen = {name: None if value is None else value[:, list(order)] for name, value in parts.items()}
+    return views.images[list(order)], replace(hints, cameras=cameras, **chosen)
+
+
+def as_given(geometry: Geometry, order: Sequence[int]) -> Geometry:
+    """Reorders geometry from processing order to the order in which the views were given."""
+    back = torch.tensor(order).argsort()
+    cameras: Cameras = geometry.cameras.select(back.to(geometry.depth.device))
+    return replace(geometry, depth=geometry.depth[:, back], depth_conf=geometry.depth_conf[:, back], cameras=cameras)

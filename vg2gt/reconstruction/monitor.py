@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 import torch
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from vg2gt.profiling import listening, now, peak_memory_mib, reset_peak_memory
 
@@ -41,6 +41,7 @@ class Monitor:
             BarColumn(24),
             MofNCompleteColumn(),
             TimeElapsedColumn(),
+            TimeRemainingColumn(),
             console=Console(stderr=True),
             disable=not show,
         )
@@ -61,35 +62,25 @@ class Monitor:
         return peak_memory_mib(self.device)
 
     @contextmanager
-    def stage(self, name: str, total: int = 1) -> Iterator[Callable[[], None]]:
-        """Measures the block; yields a function to call after each of ``total`` steps.
+    def stage(self, name: str, total: int = 1) -> Iterator[Callable[..., None]]:
+        """Measures the block.
 
-        Leaving the block completes the progress bar.
+        Yields:
+            A function to call after each of ``total`` steps, or with the number of steps done and a note to show.
         """
-        with self._running_as(name, total) as task:
-            yield lambda: self._progress.update(task, advance=1)
-
-    @contextmanager
-    def measure(self, name: str) -> Iterator[Callable[[float, str], None]]:
-        """Measures the block; yields a function that takes the share done and a note, shown with the time left."""
-        with self._running_as(name, 100) as task:
-            began = now(self.device)
-
-            def show(done: float, note: str) -> None:
-                left = (now(self.device) - began) * (1 - done) / done if done > 0 else 0.0
-                said = f"{name} {note}, {left:.0f} s left"
-                self._progress.update(task, completed=round(100 * done), description=said)
-
-            yield show
-
-    @contextmanager
-    def _running_as(self, name: str, total: int) -> Iterator[TaskID]:
         self._settle()
         self._running.append(name)
         self.seconds.setdefault(name, 0.0)
         task = self._progress.add_task(name, total=total)
+
+        def advance(done: float | None = None, note: str = "") -> None:
+            if done is None:
+                self._progress.update(task, advance=1)
+            else:
+                self._progress.update(task, completed=round(done), description=f"{name} {note}")
+
         try:
-            yield task
+            yield advance
             self._progress.update(task, completed=total, description=name)
         finally:
             self._settle()
@@ -105,10 +96,11 @@ class Monitor:
     @contextmanager
     def watching(self) -> Iterator[None]:
         """Reports the stages that a model marks inside the block as stages of this monitor."""
-        with listening(lambda name: self._labelled(_LABELS.get(name, name))):
-            yield
 
-    @contextmanager
-    def _labelled(self, label: str) -> Iterator[None]:
-        with self.stage(label):
+        @contextmanager
+        def labelled(name: str) -> Iterator[None]:
+            with self.stage(_LABELS.get(name, name)):
+                yield
+
+        with listening(labelled):
             yield

@@ -1,16 +1,17 @@
-"""Writes the named outputs of a scene."""
+"""Writes the named outputs of a scene, and what is rendered of it: a folder per kind of map, or an animation."""
 
 from __future__ import annotations
 
 import io
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from vg2gt.geometry.cameras import unproject
@@ -23,31 +24,34 @@ from vg2gt.io import (
     write_cameras_json,
     write_colmap,
     write_gaussian_ply,
-    write_glb,
     write_mesh,
     write_point_ply,
     write_spz,
     write_tiles,
     write_transforms,
 )
-from vg2gt.io.files import write_bytes, write_json
-from vg2gt.io.images import to_pixels, write_png
-from vg2gt.io.video import require_pyav
-from vg2gt.reconstruction.camera_paths import orbit
+from vg2gt.io.files import whole_folder, write_bytes, write_json
+from vg2gt.io.images import colorize_depth, colorize_normals, grid, to_pixels, write_png
+from vg2gt.io.video import write_video
+from vg2gt.reconstruction.camera_files import view_stem
 from vg2gt.reconstruction.export import exported_views
-from vg2gt.reconstruction.maps import AddView, animation, feed, map_sinks, whole_folder
 from vg2gt.reconstruction.monitor import Monitor
-from vg2gt.reconstruction.output_names import DEFAULT, FPS, MAPS, ORBIT_FRAMES, OUTPUTS, PREDICTED, REFINED
+from vg2gt.reconstruction.output_names import DEFAULT, MAPS, OUTPUTS, PREDICTED, REFINED
+from vg2gt.reconstruction.pictures import spread
 from vg2gt.reconstruction.refined import before_and_after, refinement_figures
-from vg2gt.reconstruction.report import html_rows, pictured, png_report, write_html_report
-from vg2gt.reconstruction.trust import trust_figures
+from vg2gt.reconstruction.trust import trust_figures, trust_picture
 from vg2gt.uncertainty import Status, point_support
 
 if TYPE_CHECKING:
-    from vg2gt.reconstruction.scene import Scene
+    from vg2gt.reconstruction.scene import RenderedView, Scene
 
+ROWS = 12  # maximum number of views in report.png
 MESH_PIXELS = 2.0  # edge of a mesh voxel, in pixels at the median depth
 _MESH_DEPTHS = 10.0  # maximum depth of the mesh, in median depths
+
+AddView: TypeAlias = "Callable[[RenderedView], None]"
+Sink: TypeAlias = AbstractContextManager[AddView]
+"""Context manager that returns a consumer of rendered views; on exit it writes what needs all views."""
 
 
 def check_outputs(outputs: Sequence[str], known: Mapping[str, str] = OUTPUTS) -> None:
@@ -80,30 +84,12 @@ def check_folder(folder: str | Path, outputs: Sequence[str], overwrite: bool) ->
     return folder
 
 
-def prepare_folder(folder: str | Path, outputs: Sequence[str], overwrite: bool) -> Path:
-    """Creates the output folder after :func:`check_folder`.
-
-    Raises:
-        FileExistsError: if an output exists and ``overwrite`` is false.
-        PermissionError: if the folder cannot be created or written to.
-    """
-    folder = check_folder(folder, outputs, overwrite)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise PermissionError(
-            f"the output folder {folder} cannot be made ({error.strerror}); choose another"
-        ) from error
-    return folder
-
-
 def write_outputs(
     scene: Scene,
     folder: str | Path,
     outputs: Sequence[str] = DEFAULT,
     *,
     overwrite: bool = False,
-    frames: int = ORBIT_FRAMES,
     mesh_voxel: float | None = None,
     figures: Mapping[str, Any] | None = None,
     monitor: Monitor | None = None,
@@ -115,56 +101,35 @@ def write_outputs(
         folder: output folder, created if missing.
         outputs: names from :data:`OUTPUTS`.
         overwrite: replace existing outputs.
-        frames: number of frames of the orbit.
         mesh_voxel: edge of the mesh voxels in scene units; None: two pixels at the median depth.
-        figures: entries of ``report.json`` and ``report.html`` in addition to those of the scene.
+        figures: entries of ``report.json`` in addition to those of the scene.
         monitor: shows and times the stages.
 
     Raises:
         FileExistsError: if an output exists and ``overwrite`` is false.
         PermissionError: if the folder cannot be written to.
-        ImportError: if an animation needs PyAV and it is not installed.
         ValueError: if an output is unknown.
     """
     check_outputs(outputs)
     pictures = [REFINED] if scene.refined is not None else []
-    folder = prepare_folder(folder, [*outputs, *pictures], overwrite)
+    folder = check_folder(folder, [*outputs, *pictures], overwrite)
     monitor = monitor or Monitor()
-    if "orbit.mp4" in outputs:
-        require_pyav("writing orbit.mp4")
     plain = [output for output in outputs if output in _WRITERS]
     if plain:
         with monitor.stage("write files", len(plain)) as advance:
             for output in plain:
                 _WRITERS[output](scene, folder / _target(output))
                 advance()
-    sinks = map_sinks(folder, outputs)
-    if meshes := [folder / output for output in outputs if output.startswith("mesh")]:
-        sinks.append(mesh_fusion(scene, meshes, mesh_voxel))
-    if "report.png" in outputs:
-        sinks.append(png_report(scene, folder / "report.png"))
     for name in pictures:
         write_png(folder / name, before_and_after(scene))
-    rows: list[str] = []
-    if "report.html" in outputs:
-        sinks.append(html_rows(scene, rows))
+    sinks = [map_folder(folder, output) for output in outputs if output in MAPS]
+    if meshes := [folder / output for output in outputs if output.startswith("mesh")]:
+        sinks.append(mesh_fusion(scene, meshes, mesh_voxel))
     if sinks:
-        cameras = scene.named_cameras()
-        if "report.png" in outputs and len(sinks) == 1:
-            cameras = [cameras[view] for view in pictured(scene)]
-        with monitor.stage("render views", len(cameras)) as advance:
-            feed(scene.render(cameras), sinks, advance)
-    if orbits := [folder / output for output in outputs if output.startswith("orbit")]:
-        path = orbit(scene.named_cameras(), float(scene.depth[scene.depth > 0].median()), frames)
-        with monitor.stage("render orbit", len(path)) as advance:
-            feed(scene.render(path), [animation(file, FPS) for file in orbits], advance)
-    facts = {**scene_figures(scene), **(figures or {}), **cost_figures(monitor)}
-    if "report.html" in outputs:
-        gif = folder / "orbit.gif" if "orbit.gif" in outputs else None
-        picture = folder / REFINED if pictures else None
-        write_html_report(folder / "report.html", rows, facts, gif, picture)
+        with monitor.stage("render views", len(scene.names)) as advance:
+            feed(scene.render(), sinks, advance)
     if "report.json" in outputs:
-        write_json(folder / "report.json", facts)
+        write_json(folder / "report.json", {**scene_figures(scene), **(figures or {}), **cost_figures(monitor)})
     return folder
 
 
@@ -180,24 +145,69 @@ def scene_figures(scene: Scene) -> dict[str, Any]:
         **refinement_figures(scene),
         **trust_figures(scene),
         "cameras": scene.cameras_from or PREDICTED,
-        **frame_figures(scene),
+        **({"frame": scene.frame.name} if scene.frame is not None else {}),
     }
-
-
-def frame_figures(scene: Scene) -> dict[str, Any]:
-    """Returns the frame and unit of a scene, and the similarity from it to the cameras as given or found."""
-    if scene.frame is None:
-        return {}
-    matrix, scale = scene.frame.to_source, scene.frame.scale
-    unit = "that of the given cameras" if scene.frame.name == "given" else "about the median depth of the views"
-    similarity = {"scale": scale, "rotation": (matrix[:3, :3] / scale).tolist(), "translation": matrix[:3, 3].tolist()}
-    return {"frame": scene.frame.name, "unit": unit, "similarity_to_cameras": similarity}
 
 
 def cost_figures(monitor: Monitor) -> dict[str, Any]:
     """Returns time by stage, peak memory and device."""
     seconds = {name: round(value, 3) for name, value in monitor.seconds.items()}
     return {"seconds": seconds, "peak_memory_mib": round(monitor.peak_memory_mib), "device": str(monitor.device)}
+
+
+@contextmanager
+def map_folder(folder: Path, output: str) -> Iterator[AddView]:
+    """Writes one kind of map of every view into a folder, which appears once it is complete.
+
+    Args:
+        folder: output folder; the maps go into a subfolder named after the kind.
+        output: a name in :data:`vg2gt.reconstruction.output_names.MAPS`.
+
+    Yields:
+        A function that writes a view's map.
+
+    Raises:
+        ValueError: if a view's name leads out of the folder or occurs twice.
+    """
+    kind, suffix = os.path.splitext(output)
+    with whole_folder(folder / kind) as staged:
+
+        def add(view: RenderedView) -> None:
+            name = view_stem(view.camera.name)
+            target = staged / f"{name}{suffix}"
+            if not target.resolve().is_relative_to(staged.resolve()):
+                raise ValueError(f"view name {view.camera.name!r} leads outside the output folder; rename it")
+            if target.exists():
+                raise ValueError(f"two views are called {name}; rename one of the cameras")
+            target.parent.mkdir(parents=True, exist_ok=True)
+            if kind == "color":
+                write_png(target, view.color)
+            else:
+                np.save(target, (view.depth if kind == "depth" else view.normal).numpy())
+
+        yield add
+
+
+@contextmanager
+def animation(path: Path, fps: float) -> Iterator[AddView]:
+    """Collects the colour of the views and writes an animation, ``.gif`` or ``.mp4``, at ``fps`` frames per second.
+
+    Raises:
+        MissingDecoderError: if it is not a GIF and PyAV is not installed.
+    """
+    frames: list[NDArray[np.uint8]] = []
+    yield lambda view: frames.append(to_pixels(view.color))
+    write_video(path, frames, fps)
+
+
+def feed(views: Iterable[RenderedView], sinks: Sequence[Sink], advance: Callable[[], None]) -> None:
+    """Passes every view to every sink, then closes the sinks; on an error, no half-written folder remains."""
+    with ExitStack() as stack:
+        takers = [stack.enter_context(sink) for sink in sinks]
+        for view in views:
+            for add in takers:
+                add(view)
+            advance()
 
 
 @contextmanager
@@ -217,25 +227,29 @@ def mesh_fusion(scene: Scene, paths: Sequence[Path], voxel_size: float | None) -
     median = float(depth[depth > 0].median())
     depth = torch.where(depth < _MESH_DEPTHS * median, depth, 0)
     if scene.support is not None:
-        depth = torch.where(_measured(scene, depth), depth, 0)
+        points = unproject(depth[None], scene.cameras.to("cpu"))[0]
+        status = [point_support(view.flatten(0, 1), scene.depth, scene.cameras.to("cpu"))[0] for view in points]
+        depth = torch.where(torch.stack(status).view_as(depth) >= Status.SINGLE, depth, 0)
     focal = float(scene.cameras.intrinsics[..., [0, 1], [0, 1]].mean())
     mesh = fuse_depth(depth, scene.cameras, colors, voxel_size=voxel_size or MESH_PIXELS * median / focal)
     for path in paths:
         write_mesh(path, mesh)
 
 
-def _measured(scene: Scene, depth: Tensor) -> Tensor:
-    """Returns where rendered depth ``[V, H, W]`` was measured by a view, rather than background or a guess."""
-    cameras = scene.cameras.to("cpu")
-    points = unproject(depth[None], cameras)[0]
-    status = torch.stack([point_support(view.flatten(0, 1), scene.depth, cameras)[0] for view in points])
-    return status.view_as(depth) >= Status.SINGLE
-
-
-def _images(scene: Scene, target: Path) -> None:
-    with whole_folder(target) as folder:
-        for name, image in zip(scene.names, scene.images, strict=True):
-            write_png(folder / f"{name}.png", image)
+def _report_png(scene: Scene, path: Path) -> None:
+    """Writes one image with a row per view, for at most 12 evenly spread views."""
+    shown = spread(len(scene.names), min(len(scene.names), ROWS))
+    visible = scene.depth[scene.depth > 0]
+    visible = visible[:: max(1, len(visible) // 1_000_000)]
+    near, far = torch.quantile(visible, torch.tensor([0.02, 0.98])).tolist()
+    cameras, rows = scene.named_cameras(), []
+    for number, view in zip(shown, scene.render([cameras[number] for number in shown]), strict=True):
+        depth, normals = colorize_depth(view.depth, near, far), colorize_normals(view.normal)
+        rows.append([scene.images[number], view.color, depth, normals])
+        if scene.support is not None:
+            error = None if scene.error is None else scene.error[number]
+            rows[-1].append(trust_picture(error, scene.support[number]))
+    write_png(path, grid(rows))
 
 
 def _views(scene: Scene, path: Path) -> None:
@@ -259,26 +273,26 @@ def _views(scene: Scene, path: Path) -> None:
     write_bytes(path, buffer.getvalue())
 
 
-def _colmap(scene: Scene, target: Path, whole: bool = True) -> None:
-    exported = exported_views(scene, whole)
+def _colmap(scene: Scene, target: Path) -> None:
+    exported = exported_views(scene)
     points, sources = scene.points(), exported.observations(scene)
     model = colmap_from_views(
         exported.cameras, exported.names, points.positions, points.colors, sources, exported.sizes
     )
     with whole_folder(target) as folder:
-        exported.write_images(folder / "images")
+        exported.write_images(scene, folder / "images")
         write_colmap(folder / "sparse" / "0", model)
 
 
-def _nerfstudio(scene: Scene, target: Path, whole: bool = True) -> None:
-    exported = exported_views(scene, whole)
+def _nerfstudio(scene: Scene, target: Path) -> None:
+    exported = exported_views(scene)
     poses, intrinsics = (t[0].double().numpy() for t in (exported.cameras.world_to_camera, exported.cameras.intrinsics))
     frames = [
         TransformsFrame(f"images/{name}", pose, Lens.from_intrinsics(k, size))
         for name, pose, k, size in zip(exported.names, poses, intrinsics, exported.sizes, strict=True)
     ]
     with whole_folder(target) as folder:
-        exported.write_images(folder / "images")
+        exported.write_images(scene, folder / "images")
         _points_ply(scene, folder / "points.ply")
         write_transforms(folder / "transforms.json", Transforms(tuple(frames), ply_file_path="points.ply"))
 
@@ -299,11 +313,6 @@ def _points_ply(scene: Scene, path: Path) -> None:
     write_point_ply(path, points.positions, points.colors)
 
 
-def _points_glb(scene: Scene, path: Path) -> None:
-    points = scene.points()
-    write_glb(path, points.positions, points.colors, scene.cameras)
-
-
 def _target(output: str) -> str:
     """Returns the file or folder name of an output."""
     return os.path.splitext(output)[0] if output in MAPS else output
@@ -316,10 +325,7 @@ _WRITERS: dict[str, Callable[[Scene, Path], Any]] = {
     "cameras.json": lambda scene, path: write_cameras_json(path, scene.named_cameras()),
     "points.ply": _points_ply,
     "views.npz": _views,
-    "points.glb": _points_glb,
-    "images": _images,
+    "report.png": _report_png,
     "colmap": _colmap,
-    "colmap-small": lambda scene, path: _colmap(scene, path, whole=False),
     "nerfstudio": _nerfstudio,
-    "nerfstudio-small": lambda scene, path: _nerfstudio(scene, path, whole=False),
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
 import logging
 import math
@@ -18,11 +19,11 @@ from numpy.typing import NDArray
 from PIL import Image, ImageOps
 from torch import Tensor
 
-from vg2gt.data.base import DataError, Frames
+from vg2gt.data.base import Frames
 from vg2gt.data.sources.masks import FOLDER as MASKS
 from vg2gt.data.sources.masks import joined_masks, mask_of, resized_mask, warn_without_mask
 from vg2gt.data.sources.parsing import IMAGE_SUFFIXES
-from vg2gt.data.transforms import from_bytes
+from vg2gt.data.transforms import from_bytes, to_bytes
 from vg2gt.io.files import by_number
 from vg2gt.io.image_files import focal_length, image_size, is_panorama, read_color, read_mask, read_mask_file
 from vg2gt.io.images import color_image, has_alpha
@@ -75,18 +76,13 @@ class Picture:
     lens: str = ""
 
 
-def find_pictures(
-    images: ImagesLike, every: int = 1, max_images: int | None = None, skip_damaged: bool = False
-) -> list[Picture]:
+def find_pictures(images: ImagesLike, max_images: int | None = None) -> list[Picture]:
     """Lists the pictures of an input, without their cameras.
 
     Args:
         images: a file, folder or video, a Pillow image, an array ``[H, W, 3]`` or ``[V, H, W, 3]`` (uint8), a tensor
             ``[3, H, W]`` or ``[V, 3, H, W]`` in [0, 1], or a sequence of these, in any mixture.
-        every: take only every N-th picture (of videos: frame).
-        max_images: maximum number of pictures, evenly spread; None: all, but 32 frames of a video unless ``every`` is
-            given.
-        skip_damaged: skip photographs that cannot be read, with a warning that names them.
+        max_images: maximum number of pictures, evenly spread; None: all, but 32 frames of a video.
 
     Returns:
         The pictures in order, with unique names.
@@ -95,18 +91,8 @@ def find_pictures(
         FileNotFoundError: if a path does not exist.
         ValueError: if there is no picture (the message names where was searched), or a file cannot be read.
     """
-    check_choice(every, max_images)
-    chosen: list[Picture] = []
-    damaged: list[str] = []
-    stills = 0
-    for item in as_items(images):
-        found = _pictures(item, every, max_images, damaged)
-        found = undamaged(found, damaged) if skip_damaged else found
-        if not _is_video(item):  # videos are already reduced to every N-th frame
-            stills += len(found)
-            found = [picture for i, picture in enumerate(found, stills - len(found)) if i % every == 0]
-        chosen += found
-    report_damaged(damaged, skip_damaged)
+    check_limit(max_images)
+    chosen = [picture for item in as_items(images) for picture in _pictures(item, max_images)]
     if not chosen:
         raise ValueError("there are no images to reconstruct; give image files, a folder of them, or a video")
     taken = evenly(chosen, max_images)
@@ -114,7 +100,7 @@ def find_pictures(
     return with_unique_names(taken)
 
 
-def check_pictures(images: ImagesLike, skip_damaged: bool = False) -> None:
+def check_pictures(images: ImagesLike) -> None:
     """Checks that files and folders hold pictures, without decoding any, before weights are downloaded.
 
     Raises:
@@ -122,7 +108,6 @@ def check_pictures(images: ImagesLike, skip_damaged: bool = False) -> None:
         ImportError: if a video needs a package that is not installed.
         ValueError: if there is no picture, or a file is not a picture.
     """
-    damaged: list[str] = []
     for item in as_items(images):
         path = existing_path(item) if isinstance(item, (str, Path)) else None
         if path is None:
@@ -130,49 +115,9 @@ def check_pictures(images: ImagesLike, skip_damaged: bool = False) -> None:
         if _is_video(path):
             require_pyav(f"reading {path}")
         elif path.is_file():
-            _pictures(path, 1, 1, damaged)
+            _pictures(path, 1)
         elif not any(file.suffix.lower() in _HOLDS_PICTURES for file in path.rglob("*")):
             image_files(path)
-    report_damaged(damaged, skip_damaged)
-
-
-def undamaged(pictures: Iterable[Picture], damaged: list[str]) -> list[Picture]:
-    """Returns the pictures that can be decoded; adds the errors of the others to ``damaged``."""
-    found = []
-    for picture in pictures:
-        try:
-            picture.read((64, 64))
-            found.append(picture)
-        except DataError as error:
-            damaged.append(str(error))
-    return found
-
-
-def decoded(pictures: Sequence[Picture], number: int, size: tuple[int, int]) -> Frames:
-    """Decodes one of the pictures as a frame of about the given size.
-
-    Raises:
-        DataError: if it cannot be read; the message names all pictures that cannot.
-    """
-    try:
-        return pictures[number].read(size)
-    except DataError as error:
-        damaged: list[str] = []
-        undamaged(pictures, damaged)
-        report_damaged(damaged or [str(error)], skip=False)
-        raise
-
-
-def report_damaged(damaged: Sequence[str], skip: bool) -> None:
-    """Warns about skipped pictures, or raises one error that names them all.
-
-    Raises:
-        DataError: if there are damaged pictures and ``skip`` is false.
-    """
-    if damaged and not skip:
-        raise DataError("; ".join(damaged) + " (--skip-damaged skips what cannot be read)")
-    if damaged:
-        log.warning("%d images cannot be read and are left out: %s", len(damaged), "; ".join(damaged))
 
 
 def as_items(images: ImagesLike) -> list[Any]:
@@ -180,15 +125,10 @@ def as_items(images: ImagesLike) -> list[Any]:
     return list(images) if isinstance(images, (list, tuple)) else [images]
 
 
-def check_choice(every: int, max_images: int | None) -> None:
-    """Checks ``every`` and ``max_images``.
-
-    Raises:
-        ValueError: if a number is below 1.
-    """
-    for name, value in (("every", every), ("max_images", max_images)):
-        if value is not None and value < 1:
-            raise ValueError(f"{name} must be at least 1, got {value}")
+def check_limit(max_images: int | None) -> None:
+    """Raises ValueError if ``max_images`` is below 1."""
+    if max_images is not None and max_images < 1:
+        raise ValueError(f"max_images must be at least 1, got {max_images}")
 
 
 def evenly(pictures: list[Picture], limit: int | None) -> list[Picture]:
@@ -246,29 +186,18 @@ def mask_for(path: Path, upright: bool = True, content: bytes | None = None) -> 
     return joined_masks(parts)
 
 
-def _pictures(item: Any, every: int, max_images: int | None, damaged: list[str]) -> list[Picture]:
-    """Returns the pictures of one item; adds errors of files that are not images to ``damaged``."""
+def _pictures(item: Any, max_images: int | None) -> list[Picture]:
     if not isinstance(item, (str, Path)):
         return _from_memory(item)
     path = existing_path(item)
     if path.is_dir():
-        return _photos(image_files(path), damaged)
+        return [_photo(file) for file in image_files(path)]
     if is_archive(path):
         files = recorded_files(path, ".jpg")
         if not files:
             raise ValueError(f"{path} holds no images (rgbd/0.jpg and so on): is it a recording of Record3D?")
         return [_photo(file, read_recorded) for file in files.values()]
-    return _video(path, every, max_images) if _is_video(path) else _photos([path], damaged)
-
-
-def _photos(files: Sequence[Path], damaged: list[str]) -> list[Picture]:
-    found: list[Picture] = []
-    for file in files:
-        try:
-            found.append(_photo(file))
-        except DataError as error:
-            damaged.append(str(error))
-    return found
+    return _video(path, max_images or VIDEO_FRAMES) if _is_video(path) else [_photo(path)]
 
 
 def image_files(folder: Path) -> list[Path]:
@@ -348,19 +277,18 @@ def _is_video(item: Any) -> bool:
     return isinstance(item, (str, Path)) and Path(item).suffix.lower() in VIDEO_SUFFIXES
 
 
-def _video(path: Path, every: int, max_images: int | None) -> list[Picture]:
-    limit = max_images or (VIDEO_FRAMES if every == 1 else None)
+def _video(path: Path, limit: int) -> list[Picture]:
     count = count_frames(path)
-    if limit is not None:
-        every = max(every, math.ceil(count / limit))
+    every = max(1, math.ceil(count / limit))
     if count > IN_MEMORY * every:
         size, frames = video_size(path), VideoFrames(path, every)
-        return [_frame_of_video(frames, f"{path.stem}-{n:06d}", n, size) for n in range(0, count, every)]
+
+        def picture(number: int) -> Picture:
+            name = f"{path.stem}-{number:06d}"
+            return Picture(name, size, lambda wanted: frame_of(shrunk(frames.read(number), wanted)))
+
+        return [picture(number) for number in range(0, count, every)]
     return [_in_memory(f"{path.stem}-{number:06d}", pixels) for number, pixels in read_video(path, every)]
-
-
-def _frame_of_video(frames: VideoFrames, name: str, number: int, size: tuple[int, int]) -> Picture:
-    return Picture(name, size, lambda wanted: frame_of(shrunk(frames.read(number), wanted)))
 
 
 def _in_memory(name: str, pixels: NDArray[np.uint8], mask: NDArray[np.float32] | None = None) -> Picture:
@@ -409,3 +337,32 @@ def with_unique_names(pictures: Sequence[Picture]) -> list[Picture]:
         taken.add(name)
         result.append(replace(picture, name=name))
     return result
+
+
+def without_copies(pictures: Sequence[Picture], decode: bool = False) -> list[Picture]:
+    """Returns the pictures without byte-identical copies of earlier files, which are named in a warning.
+
+    Args:
+        pictures: in order.
+        decode: also compare the pixels of pictures without a file of their own; otherwise these are all kept.
+    """
+    first: dict[str, str] = {}
+    found, copies = [], []
+    for picture in pictures:
+        whole = picture.path is not None and picture.path.suffix.lower() in (*IMAGE_SUFFIXES, *HEIC_SUFFIXES)
+        key = digest(picture) if whole or (decode and picture.path is None) else ""
+        if key and key in first:
+            copies.append(f"{picture.name} (as {first[key]})")
+        else:
+            found.append(picture)
+            first[key] = picture.name
+    if copies:
+        log.warning("%d images are copies of others and are left out: %s", len(copies), ", ".join(copies[:10]))
+    return found
+
+
+def digest(picture: Picture) -> str:
+    """Returns the hash of a picture's file, or of its pixels if it has none."""
+    if picture.path is not None:
+        return hashlib.sha256(picture.path.read_bytes()).hexdigest()
+    return hashlib.sha256(to_bytes(picture.read(picture.size).images).numpy().tobytes()).hexdigest()

@@ -1,12 +1,11 @@
-"""From images to a scene in one call."""
+"""From images to a scene in one call; adds images to a scene that was made in windows, and removes them again."""
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+import shutil
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import torch
@@ -14,21 +13,22 @@ import torch
 from vg2gt.geometry.precision import half_precision_on_gpu
 from vg2gt.memory import RECONSTRUCTION, memory_advice, note_sizes
 from vg2gt.method.additions.far_shell import far_shell
-from vg2gt.model import Reconstructor
+from vg2gt.model import VG2GT, Reconstructor
 from vg2gt.reconstruction.cameras import Poses, pictures_for
-from vg2gt.reconstruction.frame import FrameName, check_frame, first_frame
-from vg2gt.reconstruction.inputs import Views, load_views, source_of, working_size
+from vg2gt.reconstruction.frame import first_frame, moved_gaussians, similarity_of
+from vg2gt.reconstruction.inputs import Views, as_given, in_order, load_views, source_of, working_order, working_size
 from vg2gt.reconstruction.monitor import Monitor
-from vg2gt.reconstruction.order import as_given, in_order, working_order
+from vg2gt.reconstruction.output_names import WINDOWS
 from vg2gt.reconstruction.pictures import SFM_SOURCE, ImagesLike, spread
+from vg2gt.reconstruction.saved import read_scene
 from vg2gt.reconstruction.scene import Scene
 from vg2gt.reconstruction.trust import pixel_trust
 from vg2gt.reconstruction.windows.capture import AUTOMATIC, window_size
-from vg2gt.reconstruction.windows.run import WindowRun, window_model
-from vg2gt.reconstruction.windows.sets import Anchor
+from vg2gt.reconstruction.windows.run import WindowRun, device_of, gaussians_of, set_key, window_model
+from vg2gt.reconstruction.windows.store import Anchor, finished_sets, joined, key_of, read_anchor, without
 from vg2gt.rendering import Renderer
 from vg2gt.runs.load import load_model
-from vg2gt.types import Gaussians, Geometry, Prediction
+from vg2gt.types import Gaussians, Geometry
 from vg2gt.uncertainty import Calibration
 
 
@@ -37,7 +37,6 @@ def reconstruct(
     ckpt: str | Path | None = None,
     backend: str | None = None,
     *,
-    every: int = 1,
     max_images: int | None = None,
     size: int | tuple[int, int] | None = None,
     window: int | None = None,
@@ -45,7 +44,7 @@ def reconstruct(
 ) -> Scene:
     """Builds a model and reconstructs a scene: :func:`load_model`, then :func:`reconstruct_with`."""
     ready = load_model(ckpt, backend, device=device)
-    choice = {"every": every, "max_images": max_images, "size": size, "window": window}
+    choice = {"max_images": max_images, "size": size, "window": window}
     return reconstruct_with(ready.model, images, renderer=ready.renderer, calibration=ready.calibration, **choice)
 
 
@@ -54,15 +53,12 @@ def reconstruct_with(
     model: Reconstructor,
     images: ImagesLike,
     *,
-    every: int = 1,
     max_images: int | None = None,
     size: int | tuple[int, int] | None = None,
     renderer: Renderer | None = None,
     monitor: Monitor | None = None,
     poses: Poses = "auto",
     sfm_folder: str | Path | None = None,
-    frame: FrameName = "auto",
-    skip_damaged: bool = False,
     window: int | None = None,
     window_folder: str | Path | None = None,
     keep_windows: bool = False,
@@ -74,27 +70,23 @@ def reconstruct_with(
     Args:
         model: the model; it is put into eval mode.
         images: see :func:`vg2gt.reconstruction.pictures.find_pictures`.
-        every: take only every N-th image.
         max_images: maximum number of images, evenly spread.
         size: see :func:`vg2gt.reconstruction.inputs.working_size`.
         renderer: renderer of the scene; None: solids, with the default options.
         monitor: shows and times the stages.
         poses: source of the cameras, see :func:`vg2gt.reconstruction.cameras.pictures_for`.
         sfm_folder: folder where cameras found by structure from motion are kept and reused; None: they are not kept.
-        frame: the scene's frame and unit (:class:`vg2gt.reconstruction.frame.SceneFrame`): ``given`` cameras',
-            ``first`` camera's, ``upright``, or ``auto``.
-        skip_damaged: skip images that cannot be read, with a warning; otherwise they are an error.
         window: process this many images and their neighbours at a time, which bounds memory
             (:mod:`vg2gt.reconstruction.windows`); 0: all at once; None: 24 if there are more than 100, else all.
         window_folder: folder for finished windows, from which an interrupted reconstruction resumes; None: a temporary
             one.
         keep_windows: always process in windows, because their voxels are kept.
-        anchor: anchor of the scene to add the images to (:mod:`vg2gt.reconstruction.windows.sets`).
+        anchor: anchor of the scene to add the images to (:mod:`vg2gt.reconstruction.windows.store`).
         calibration: calibration of the model, from which errors are stated; None, or in windows: no stated errors.
 
     Returns:
-        The scene in the requested frame; its Gaussians stay on the model's device. For a scene made in windows, images
-        and depth are memory-mapped.
+        The scene in the frame of given cameras, else upright; its Gaussians stay on the model's device. For a scene
+        made in windows, images and depth are memory-mapped.
 
     Raises:
         FileNotFoundError: if a path does not exist.
@@ -102,18 +94,15 @@ def reconstruct_with(
         ValueError: if there are no images, one cannot be read, or they lack what the backend needs.
         OutOfMemory: if the device's memory is full.
     """
-    check_frame(frame)
     monitor = monitor or Monitor()
-    device = next((parameter.device for parameter in model.parameters()), torch.device("cpu"))
+    device = device_of(model)
     chosen = pictures_for(
         model,
         images,
         poses,
-        every=every,
         max_images=max_images,
         sfm_folder=None if sfm_folder is None else Path(sfm_folder),
         monitor=monitor,
-        skip_damaged=skip_damaged,
     )
     with memory_advice(RECONSTRUCTION), chosen as pictures:
         sizes = [picture.size for picture in pictures]
@@ -122,43 +111,29 @@ def reconstruct_with(
         size_of_windows, to_source = window_size(window, len(pictures), keep_windows or anchor is not None), None
         error, support = None, None
         if size_of_windows:
-            with _folder(window_folder) as kept:
-                run = WindowRun(window_model(model.eval()), pictures, target, size_of_windows, kept, monitor, anchor)
+            # memory-mapped files stay readable after their removal
+            with TemporaryDirectory(prefix="vg2gt-windows-", ignore_cleanup_errors=True) as temporary:
+                place = Path(window_folder or temporary)
+                run = WindowRun(window_model(model.eval()), pictures, target, size_of_windows, place, monitor, anchor)
                 geometry, gaussians, unit = run.geometry_and_gaussians()
                 views = run.views()
                 to_source = run.anchor.to_source if run.anchor and source_of(pictures) else None
         else:
             views = load_views(pictures, target, monitor)
             order = working_order(views.images)
-            prediction = _forward(model.eval(), views, order, device, monitor)
+            ordered, hints = in_order(views, order)
+            ordered, hints = ordered[None].to(device), hints.to(device)
+            with monitor.stage("reconstruct"), monitor.watching(), half_precision_on_gpu(ordered):
+                prediction = model.eval()(ordered, hints)
             geometry, gaussians = as_given(prediction.surface.detach(), order), prediction.gaussians
             unit = prediction.unit
             error, support = pixel_trust(prediction, order, views.mask, calibration)
-    scene = _scene(geometry, gaussians, float(unit), views, renderer or Renderer(), model.backend.is_metric, frame)
+    scene = _scene(geometry, gaussians, float(unit), views, renderer or Renderer(), model.backend.is_metric)
     scene = replace(scene, error=error, support=support)
     if to_source is not None and scene.frame is not None:  # exactly the same for all image sets
         scene = replace(scene, frame=replace(scene.frame, to_source=to_source))
     scene = scene if model.visibility is None or anchor else with_far_shell(scene)
     return scene.placed()
-
-
-def _forward(
-    model: Reconstructor, views: Views, order: Sequence[int], device: torch.device, monitor: Monitor
-) -> Prediction:
-    ordered, hints = in_order(views, order)
-    images, hints = ordered[None].to(device), hints.to(device)
-    with monitor.stage("reconstruct"), monitor.watching(), half_precision_on_gpu(images):
-        return model(images, hints)
-
-
-@contextmanager
-def _folder(given: str | Path | None) -> Iterator[Path]:
-    """Yields the folder, or a temporary one; memory-mapped files stay readable after their removal."""
-    if given is not None:
-        yield Path(given)
-        return
-    with tempfile.TemporaryDirectory(prefix="vg2gt-windows-", ignore_cleanup_errors=True) as temporary:
-        yield Path(temporary)
 
 
 def with_far_shell(scene: Scene) -> Scene:
@@ -180,14 +155,12 @@ def _scene(
     views: Views,
     renderer: Renderer,
     is_metric: bool,
-    wanted: FrameName,
 ) -> Scene:
     source = views.pictures[0].source
-    kind = "predicted" if not source else "found" if source.startswith(SFM_SOURCE) else "given"
-    check_frame(wanted, kind)
     known = [picture.pose for picture in views.pictures if picture.pose is not None]
-    poses = np.stack(known) if kind != "predicted" and len(known) == len(views.names) else None
-    frame = first_frame(geometry.cameras, unit, poses, kind, wanted)
+    poses = np.stack(known) if source and len(known) == len(views.names) else None
+    target = "given" if source and not source.startswith(SFM_SOURCE) else "upright"
+    frame = first_frame(geometry.cameras, unit, poses, target)
     metres = float(geometry.scale) if is_metric else frame.scale if views.pictures[0].is_metric else None
     if not len(gaussians):
         raise ValueError("the backend found no depth in any image, so there is nothing to reconstruct")
@@ -205,3 +178,72 @@ def _scene(
         mask=views.mask,
         pictures=views.pictures,
     )
+
+
+def add_images(
+    model: VG2GT, folder: Path, images: ImagesLike, renderer: Renderer, monitor: Monitor, window: int | None = None
+) -> Scene:
+    """Adds images, whose cameras are given in the same frame, to the scene in a folder; writes no outputs.
+
+    Args:
+        model: model that made the scene.
+        folder: output folder of ``vg2gt reconstruct --keep-windows``.
+        images: see :func:`vg2gt.reconstruction.pictures.find_pictures`.
+        renderer: renderer of the scene.
+        monitor: shows and times the stages.
+        window: see :func:`reconstruct_with`.
+
+    Returns:
+        The scene with the images.
+
+    Raises:
+        FileNotFoundError: if the folder keeps no voxels.
+        ValueError: if another model made the scene, or it already has images of the same names.
+    """
+    old, anchor = read_scene(folder, renderer, device_of(model)), _anchor(model, folder)
+    with pictures_for(model, images, "given") as pictures:
+        there = sorted({picture.name for picture in pictures} & set(old.names))
+    if there:
+        raise ValueError(f"the scene already has images with these names: {', '.join(there[:10])}; rename them")
+    new = reconstruct_with(
+        model,
+        images,
+        renderer=renderer,
+        monitor=monitor,
+        poses="given",
+        window=window,
+        window_folder=folder / WINDOWS,
+        anchor=anchor,
+    )
+    scene = joined(old, new)
+    return scene if model.visibility is None else with_far_shell(scene)
+
+
+def take_out(
+    model: VG2GT, folder: Path, images: ImagesLike, renderer: Renderer, monitor: Monitor, window: int | None = None
+) -> Scene:
+    """Removes images that one command added from the scene in a folder; arguments as for :func:`add_images`.
+
+    Raises:
+        FileNotFoundError: if the folder keeps no voxels.
+        ValueError: if another model made the scene, or exactly these images were not added together.
+    """
+    old, anchor, kept = read_scene(folder, renderer, device_of(model)), _anchor(model, folder), folder / WINDOWS
+    with pictures_for(model, images, "given") as pictures:
+        names = {picture.name for picture in pictures}
+        size = window_size(window, len(pictures), kept=True)
+        place = kept / set_key(model, pictures, anchor.size, size, anchor)[:12]
+    if place not in finished_sets(kept):
+        raise ValueError("these images were not added by one command: give the same folder and the same --window")
+    scene = without(old, names)
+    gaussians = gaussians_of(model, kept, anchor, monitor, left_out=place)
+    scene = replace(scene, gaussians=moved_gaussians(gaussians, similarity_of(anchor.to_source)))
+    shutil.rmtree(place)
+    return scene if model.visibility is None else with_far_shell(scene)
+
+
+def _anchor(model: VG2GT, folder: Path) -> Anchor:
+    anchor = read_anchor(folder / WINDOWS)
+    if anchor.model != key_of(window_model(model)):
+        raise ValueError(f"{folder} was made with another model: take the same backend, checkpoint and options")
+    return anchor

@@ -13,7 +13,7 @@ from torch import Tensor
 from vg2gt.io.images import colorize_normals, grid
 from vg2gt.reconstruction.monitor import Monitor
 from vg2gt.reconstruction.pictures import spread
-from vg2gt.refinement import Observations, Progress, Refined, RefinedScene, RefineOptions, refine
+from vg2gt.refinement import Observations, RefinedScene, RefineOptions, refine
 
 if TYPE_CHECKING:
     from vg2gt.reconstruction.scene import Scene
@@ -46,10 +46,10 @@ def refine_scene(
     """
     device = scene.gaussians.means.device
     seen = Observations(scene.images, scene.depth, scene.depth_conf, scene.mask).to(device)
-    with (monitor or Monitor()).measure("refine") as show:
+    with (monitor or Monitor()).stage("refine", 100) as advance:
 
-        def observe(progress: Progress) -> None:
-            show(progress.done, f"{progress.psnr:.2f} dB")
+        def observe(_: int, done: float, psnr: float) -> None:
+            advance(100 * done, f"{psnr:.2f} dB")
 
         refined = refine(scene.gaussians, scene.cameras, seen, scene.renderer, options, observe, clock)
     return replace(scene, gaussians=refined.scene.gaussians, cameras=refined.scene.cameras, refined=refined)
@@ -76,9 +76,11 @@ def refinement_figures(scene: Scene) -> dict[str, Any]:
     return {"refinement": figures}
 
 
-def refinement_lines(refined: Refined) -> list[str]:
-    """Returns the lines of a short table: views, PSNR before and after, Gaussians."""
-    lines = []
+def refinement_lines(scene: Scene) -> list[str]:
+    """Returns a short table of a refinement (views, PSNR before and after, Gaussians); empty if there was none."""
+    refined, lines = scene.refined, []
+    if refined is None:
+        return lines
     for name, views in (("trained on", refined.trained), ("held out", refined.held_out)):
         if len(views):
             before, after = refined.psnr[:, views].mean(1).tolist()
@@ -101,11 +103,12 @@ def before_and_after(scene: Scene) -> Tensor:
     views = torch.cat((refined.held_out, trained))[:ROWS]
 
     def panels(state: RefinedScene, view: Tensor) -> tuple[Tensor, Tensor]:
+        view = view.to(state.gaussians.means.device)
         shown = scene.renderer(state.gaussians, state.cameras.select(view)).to("cpu")
         return shown.color[0, 0].clamp(0, 1), colorize_normals(shown.normal[0, 0])
 
     rows = []
     for view in views.split(1):
-        before, after = (panels(state, view.to(state.gain.device)) for state in (refined.start, refined.scene))
+        before, after = (panels(state, view) for state in (refined.start, refined.scene))
         rows.append([scene.images[int(view)], before[0], after[0], before[1], after[1]])
     return grid(rows)

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2, vq
 
 ALL_PAIRS = 60  # number of photographs up to which all pairs are matched
 DISTANCES = (1, 2, 4, 8, 16)  # to the paired photographs in the given order
@@ -52,17 +53,11 @@ def _vlad(descriptors: Sequence[NDArray[np.uint8]], seed: int) -> NDArray[np.flo
     if not len(everything):
         return np.zeros((len(descriptors), 1), np.float32)
     sample = everything[rng.permutation(len(everything))[:SAMPLE]].astype(np.float32)
-    words = sample[:WORDS]
-    for _ in range(ROUNDS):
-        nearest = _nearest(sample, words)
-        sums = np.zeros_like(words)
-        np.add.at(sums, nearest, sample)
-        members = np.bincount(nearest, minlength=len(words))[:, None]
-        words = np.where(members > 0, sums / np.maximum(members, 1), words).astype(np.float32)
+    words, _ = kmeans2(sample, sample[:WORDS], ROUNDS, minit="matrix")
     found = np.zeros((len(descriptors), *words.shape), np.float32)
     for row, own in enumerate(descriptors):
         features = own.astype(np.float32)
-        nearest = _nearest(features, words)
+        nearest, _ = vq(features, words)
         np.add.at(found[row], nearest, features - words[nearest])
     # Normalise the part of each word first, so that none dominates.
     return _unit(_unit(found).reshape(len(found), -1))
@@ -71,7 +66,3 @@ def _vlad(descriptors: Sequence[NDArray[np.uint8]], seed: int) -> NDArray[np.flo
 def _unit(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
     length = np.sqrt((vectors**2).sum(-1, keepdims=True, dtype=np.float32))
     return vectors / np.maximum(length, np.float32(LEAST))
-
-
-def _nearest(features: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.int64]:
-    return np.argmin((words**2).sum(1) - 2 * features @ words.T, axis=1)

@@ -1,22 +1,31 @@
-"""Density control: fewer Gaussians where views do not support them, more where one is not enough."""
+"""Density control: fewer Gaussians where views do not support them, and some in holes, where there are none."""
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
+from vg2gt.geometry.cameras import unproject
 from vg2gt.geometry.rotations import matrix_to_quat, quat_to_matrix
+from vg2gt.geometry.spherical_harmonics import rgb_to_sh
 from vg2gt.method.additions.far_shell import is_far
-from vg2gt.method.additions.surfel import ALONE, layout
+from vg2gt.method.additions.surfel import ALONE
 from vg2gt.method.additions.visibility import count_points
 from vg2gt.method.grid import plan_voxels, point_cells, pool_mean
+from vg2gt.refinement.options import Observations
 from vg2gt.refinement.parameters import Parameters
+from vg2gt.rendering import Renderer
 from vg2gt.types import Cameras, Gaussians
 
 TOLERANCE, MARGIN = 0.03, 0.05  # relative depth differences at which a view agrees with a Gaussian, or looks through it
 FEWEST = 2  # minimum number of views that agree with Gaussians to merge
 GROWTH = 2.0  # factor on merged standard deviations: neighbours overlap, and refinement has to add the detail
 OPACITY = 0.5  # of merged Gaussians
+COVERED = 0.5  # minimum accumulated opacity of a covered pixel
+FILLED = 0.9  # opacity of a Gaussian in a hole: high enough to cover its block, low enough to be pruned if it is wrong
 
 
 def supported(gaussians: Gaussians, cameras: Cameras, depth: Tensor, views: int, merge_cells: float = 0.0) -> Gaussians:
@@ -92,33 +101,83 @@ def prune(parameters: Parameters, min_opacity: float) -> int:
 
 
 @torch.no_grad()
-def split(parameters: Parameters, count: int) -> int:
-    """Splits the ``count`` Gaussians with the largest position gradients in two; returns the number of splits.
+def fill_holes(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    seen: Observations,
+    renderer: Renderer,
+    views: Tensor,
+    side: int,
+    room: int,
+) -> Gaussians:
+    """Adds round Gaussians along uncovered rays, at depths spread from around each hole.
 
-    The halves are laid out along the longest axis like the Gaussians of a voxel (self-split, K = 2): 0.3 cells to
-    either side and 0.7 times as long. A cell is what a single Gaussian covers.
+    A backbone has no depth for glass, beyond a sensor's range, or for the sky, so a feed-forward scene shows its
+    background there. View by view, each block of mostly uncovered pixels gets one Gaussian, and is covered for the
+    next view. The depth is a guess that refinement has to correct.
+
+    Args:
+        gaussians: the scene (B = 1).
+        cameras: cameras of its V views (B = 1).
+        seen: observations of the views.
+        renderer: renderer that decides what is covered.
+        views: ``[N]`` views to fill.
+        side: side of a block in pixels.
+        room: maximum number of Gaussians to add; if there would be more, blocks are larger.
+
+    Returns:
+        The scene with the new Gaussians after its own.
     """
-    pull = parameters.pull()
-    chosen = pull.topk(min(count, len(pull))).indices
-    chosen = chosen[pull[chosen] > 0].sort().values
-    if not len(chosen):
-        return 0
-    longest, shift = _along_longest(parameters, chosen)
-    places, scales = layout(2, parameters.unit)
-    rest = torch.ones_like(pull, dtype=torch.bool)
-    rest[chosen] = False
-    parameters.take(torch.cat((rest.nonzero()[:, 0], chosen, chosen)))
-    halves = parameters.values["means"].detach()[-2 * len(chosen) :].unflatten(0, (2, -1))
-    halves += places[:, :1, None] * shift
-    logs = parameters.values["scales"].detach()[-2 * len(chosen) :].unflatten(0, (2, -1))
-    logs += (scales[0, 0] / ALONE).log() * longest
-    return len(chosen)
+    found = renderer(gaussians, cameras.select(views))
+    holes = int((found.alpha < COVERED).sum())
+    if not holes or room < 1:
+        return gaussians
+    pixels = max(side, math.ceil(math.sqrt(holes / room)))
+    for view in views.split(1):
+        camera, shown = cameras.select(view), seen.views(view)
+        rendered = renderer(gaussians, camera)
+        hole = (rendered.alpha[0] < COVERED)[:, None].to(shown.images.dtype)  # [1, 1, H, W]
+        depth = torch.where(shown.depth > 0, shown.depth, torch.where(hole[:, 0] > 0, 0.0, rendered.depth[0]))
+        if not (depth > 0).any():
+            continue
+        gaussians = gaussians.joined(_blocks(shown.images, hole, spread(depth), camera, pixels))
+    return gaussians
 
 
-def _along_longest(parameters: Parameters, rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns the longest axis, ``[N, 3]`` one-hot, and the cell along it, ``[N, 3]`` in the units of the positions."""
-    scales = parameters.values["scales"].detach()[rows].exp()
-    length, axis = scales.max(-1)
-    longest = torch.nn.functional.one_hot(axis, 3).to(scales.dtype)
-    direction = (quat_to_matrix(parameters.values["quats"].detach()[rows]) * longest[:, None]).sum(-1)
-    return longest, direction * (length / ALONE / parameters.unit[rows])[:, None]
+def spread(depth: Tensor) -> Tensor:
+    """Fills zeros of depth ``[V, H, W]`` from around them, with means of the logarithm over ever larger blocks."""
+    known = (depth > 0).to(depth.dtype)[:, None]
+    return _pushed(torch.where(known > 0, depth[:, None].clamp(min=1e-12).log(), 0.0), known)[:, 0].exp()
+
+
+def _pushed(values: Tensor, known: Tensor) -> Tensor:
+    """Returns ``values [V, 1, H, W]``, interpolated smoothly from nearby where they are not ``known``."""
+    if known.bool().all() or max(values.shape[-2:]) == 1:
+        return values
+    share = F.avg_pool2d(known, 2, ceil_mode=True)
+    mean = F.avg_pool2d(values * known, 2, ceil_mode=True) / share.clamp(min=1e-6)
+    coarse = _pushed(mean, (share > 0).to(values.dtype))
+    return torch.where(known > 0, values, F.interpolate(coarse, values.shape[-2:], mode="bilinear"))
+
+
+def _blocks(images: Tensor, hole: Tensor, depth: Tensor, camera: Cameras, pixels: int) -> Gaussians:
+    """Returns a Gaussian for each block of one view that is mostly ``hole [1, 1, H, W]``."""
+
+    def mean(values: Tensor) -> Tensor:  # over the hole's pixels in each block: [N, C]
+        pooled = F.avg_pool2d(values * hole, pixels, ceil_mode=True) / share.clamp(min=1e-6)
+        return pooled[0].flatten(1).T[chosen]
+
+    share = F.avg_pool2d(hole, pixels, ceil_mode=True)
+    chosen = (share > 0.5).flatten()
+    means = mean(unproject(depth[None], camera)[0].movedim(-1, 1))
+    focal = camera.intrinsics[0, 0, [0, 1], [0, 1]].mean()
+    size = ALONE * pixels * mean(depth[:, None]) / focal  # [N, 1]
+    turn = F.pad(torch.ones_like(size), (0, 3))
+    return Gaussians(
+        means,
+        turn,
+        size.expand(-1, 3),
+        torch.full_like(size[:, 0], FILLED),
+        rgb_to_sh(mean(images))[:, None],
+        torch.zeros_like(size[:, 0], dtype=torch.int64),
+    )

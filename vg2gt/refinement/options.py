@@ -1,13 +1,116 @@
-"""Options of a refinement; the configurations in ``configs/refine`` list all of them."""
+"""Options and loss of a refinement; the configurations in ``configs/refine`` list all of them."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, replace
 
+import torch
+from torch import Tensor
+
+from vg2gt.geometry.normals import normals_from_depth
 from vg2gt.geometry.spherical_harmonics import MAX_DEGREE
-from vg2gt.refinement.loss import RefineLoss
+from vg2gt.losses.gaussian import normal_error, weighted_mean
+from vg2gt.losses.gaussian import structure_loss
+from vg2gt.types import Cameras, Render, TensorRecord
 
 RENDERINGS = 12  # of each view, if neither steps nor seconds are set
+MIN_ALPHA = 0.5
+
+
+@dataclass(frozen=True)
+class Observations(TensorRecord):
+    """Observations of V views of one scene.
+
+    Attributes:
+        images: ``[V, 3, H, W]`` in [0, 1].
+        depth: ``[V, H, W]`` decoded z-depth in scene units, 0 = none.
+        depth_conf: ``[V, H, W]`` its confidence, > 0.
+        mask: ``[V, H, W]`` in [0, 1], pixel weights; None: all pixels count.
+    """
+
+    images: Tensor
+    depth: Tensor
+    depth_conf: Tensor
+    mask: Tensor | None = None
+
+    def views(self, views: Tensor) -> Observations:
+        """Returns the observations of some views."""
+        return self.map(lambda tensor: tensor[views])
+
+
+@dataclass(frozen=True)
+class RefineLoss:
+    """Loss of rendered views, and a weight on the opacity of the Gaussians.
+
+    Colour alone roughens surfaces: Gaussians in front of and behind a surface explain a pixel as well. The geometry
+    terms hold Gaussians at the decoded depth, weighted by its confidence, and orient them along the surface that they
+    form. They count where the accumulated opacity exceeds one half.
+
+    Args:
+        color_l1: weight of the L1 colour error.
+        ssim: weight of ``1 - SSIM`` (11 x 11 window, sigma 1.5).
+        depth_consistency: weight of the L1 distance to the decoded depth, in median depths of the scene.
+        normal_render: weight of ``1 - cos`` between rendered normals and the normals of the rendered depth.
+        normal_decoded: weight of ``1 - cos`` between rendered normals and the normals of the decoded depth.
+        opacity: weight of the mean opacity, which makes Gaussians that no image needs transparent.
+
+    Raises:
+        ValueError: if a weight is negative.
+    """
+
+    color_l1: float = 1.0
+    ssim: float = 0.2
+    depth_consistency: float = 2.0
+    normal_render: float = 0.1
+    normal_decoded: float = 0.1
+    opacity: float = 0.0
+
+    def __post_init__(self) -> None:
+        _not_negative(self, "loss")
+
+    @property
+    def needs_geometry(self) -> bool:
+        """Whether any term uses rendered depth or normals."""
+        return bool(self.depth_consistency or self.normal_render or self.normal_decoded)
+
+    def of_views(self, rendered: Render, cameras: Cameras, seen: Observations, unit: float) -> dict[str, Tensor]:
+        """Returns the unweighted terms of R rendered views whose weight is not 0, as scalars with autograd graph.
+
+        Args:
+            rendered: rendered views (B = 1).
+            cameras: cameras they were rendered with (B = 1).
+            seen: observations of the views.
+            unit: median depth of the scene.
+        """
+        color, depth, normal = rendered.color[0], rendered.depth[0], rendered.normal[0]
+        terms: dict[str, Tensor] = {}
+        if self.color_l1:
+            terms["color_l1"] = (color - seen.images).abs().mean()
+        if self.ssim:
+            terms["ssim"] = structure_loss(color, seen.images)
+        if not self.needs_geometry:
+            return terms
+        hits = (depth > 0) & (rendered.alpha[0] > MIN_ALPHA)
+        if self.depth_consistency:
+            error = (torch.where(hits, depth, 0.0) - seen.depth).abs() / unit
+            terms["depth_consistency"] = weighted_mean(error, seen.depth_conf, hits & (seen.depth > 0))
+        if self.normal_render:
+            expected, valid = normals_from_depth(torch.where(hits, depth, 0.0), cameras.intrinsics[0])
+            terms["normal_render"] = normal_error(normal, expected, torch.ones_like(depth), hits & valid)
+        if self.normal_decoded:
+            expected, valid = normals_from_depth(seen.depth, cameras.intrinsics[0])
+            terms["normal_decoded"] = normal_error(normal, expected, seen.depth_conf, hits & valid)
+        return terms
+
+    def total(self, terms: dict[str, Tensor]) -> Tensor:
+        """Returns the weighted sum of the terms."""
+        return torch.stack([getattr(self, name) * value for name, value in terms.items()]).sum()
+
+
+def _not_negative(options: RefineLoss | RefineRates, name: str) -> None:
+    for key, value in asdict(options).items():
+        if not value >= 0:
+            raise ValueError(f"refine.{name}.{key} must be at least 0, got {value}")
 
 
 @dataclass(frozen=True)
@@ -22,8 +125,6 @@ class RefineRates:
         sh: of the constant colour coefficient; the higher bands have a twentieth of it (as in 3DGS).
         cameras: of rotations and shifts, in pixels: a rotation by one pixel, or a shift that moves points at the median
             depth by one pixel.
-        focal: of the logarithm of one factor for all focal lengths.
-        exposure: of each view's log gain and bias, one per colour channel.
 
     Raises:
         ValueError: if a rate is negative.
@@ -35,13 +136,9 @@ class RefineRates:
     opacities: float = 0.05
     sh: float = 0.02
     cameras: float = 0.03
-    focal: float = 0.0
-    exposure: float = 0.0
 
     def __post_init__(self) -> None:
-        for name, value in asdict(self).items():
-            if not value >= 0:
-                raise ValueError(f"refine.rates.{name} must be at least 0, got {value}")
+        _not_negative(self, "rates")
 
 
 @dataclass(frozen=True)
@@ -55,7 +152,7 @@ class RefineOptions:
         views_per_step: number of views rendered per step.
         final_rate: factor to which rates decay exponentially.
         check_every: number of steps between checks. In between, some views are left out, in rotation. A check scores
-            them, prunes transparent Gaussians and, in the first half, splits those with large position gradients.
+            them and prunes transparent Gaussians.
         holdout: never train on every N-th view, but score it before and after; None: train on all.
         sh_degree: degree of the colours, if higher than the scene's; None: the scene's.
         fill: side in pixels of the blocks that get a Gaussian where the scene has none; 0: keep holes.
@@ -64,8 +161,7 @@ class RefineOptions:
         merge_cells: merge Gaussians at the start if at least two, but fewer than ``min_views``, views agree with them,
             in cells this many times as wide as what the median Gaussian covers. 0: remove them.
         prune_opacity: opacity below which Gaussians are removed.
-        split_share: share of the Gaussians to split at a check, those with the largest position gradients.
-        max_growth: maximum number of Gaussians, as a multiple of the initial number.
+        max_growth: maximum number of Gaussians after filling holes, as a multiple of the initial number.
         seed: random seed of the view order.
         rates: learning rates.
         loss: loss to minimise.
@@ -85,7 +181,6 @@ class RefineOptions:
     min_views: int = 0
     merge_cells: float = 0.0
     prune_opacity: float = 0.02
-    split_share: float = 0.0
     max_growth: float = 1.5
     seed: int = 0
     rates: RefineRates = field(default_factory=RefineRates)
@@ -104,7 +199,6 @@ class RefineOptions:
             ("min_views", self.min_views >= 0, "at least 0"),
             ("merge_cells", self.merge_cells >= 0, "at least 0"),
             ("prune_opacity", 0 <= self.prune_opacity < 1, "at least 0 and below 1"),
-            ("split_share", 0 <= self.split_share <= 1, "between 0 and 1"),
             ("max_growth", self.max_growth >= 1, "at least 1"),
         ):
             if not good:

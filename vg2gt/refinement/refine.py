@@ -5,20 +5,17 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from vg2gt.losses.gaussian import where_it_counts
 from vg2gt.metrics import psnr
-from vg2gt.refinement.density import prune, split, supported
-from vg2gt.refinement.fill import fill_holes
-from vg2gt.refinement.loss import Observations
-from vg2gt.refinement.options import RefineOptions
+from vg2gt.refinement.density import fill_holes, prune, supported
+from vg2gt.refinement.options import Observations, RefineOptions
 from vg2gt.refinement.parameters import Parameters, RefinedScene
-from vg2gt.refinement.views import ViewOrder
 from vg2gt.rendering import Renderer
 from vg2gt.types import Cameras, Gaussians
 
@@ -26,45 +23,9 @@ log = logging.getLogger(__name__)
 
 WORSE = 2.0  # loss of left-out views, relative to the start and to the best state, that counts as divergence
 RETREATS = 4  # maximum number of retreats; each halves the rates
+FEWEST = 4  # with fewer views, none is left out
+LEFT_OUT = 8  # one view in this many is left out at a time
 SMOOTH = 3  # number of checks to average, since each scores other views
-
-
-@dataclass(frozen=True)
-class Check:
-    """Progress report of a refinement.
-
-    Attributes:
-        step: steps so far.
-        seconds: elapsed on the refinement's clock.
-        score: loss of left-out views relative to their loss at the start; mean of the last checks.
-        psnr: mean in dB of the views rendered since the last check, each before the step that trained on it.
-        gaussians: number of Gaussians.
-    """
-
-    step: int
-    seconds: float
-    score: float
-    psnr: float
-    gaussians: int
-
-
-@dataclass(frozen=True)
-class Progress:
-    """State passed to the observer after every step.
-
-    Attributes:
-        step: steps so far.
-        done: share of the refinement that is done.
-        psnr: mean of the last 20 steps, in dB.
-        gaussians: number of Gaussians.
-        scene: returns the current state.
-    """
-
-    step: int
-    done: float
-    psnr: float
-    gaussians: int
-    scene: Callable[[], RefinedScene]
 
 
 @dataclass(frozen=True)
@@ -81,7 +42,6 @@ class Refined:
         psnr: ``[2, V]`` PSNR of every view before and after, in dB.
         trained: ``[N]`` views that were trained on.
         held_out: ``[V - N]`` the other views.
-        checks: progress reports.
         retreats: number of returns to the best state.
     """
 
@@ -94,7 +54,6 @@ class Refined:
     psnr: Tensor
     trained: Tensor
     held_out: Tensor
-    checks: Sequence[Check] = field(default_factory=tuple)
     retreats: int = 0
 
 
@@ -104,7 +63,7 @@ def refine(
     seen: Observations,
     renderer: Renderer,
     options: RefineOptions | None = None,
-    observe: Callable[[Progress], None] | None = None,
+    observe: Callable[[int, float, float], None] | None = None,
     clock: Callable[[], float] = time.monotonic,
 ) -> Refined:
     """Optimises one scene on the images of its views.
@@ -118,7 +77,8 @@ def refine(
         seen: observations of the views, on the same device.
         renderer: renderer of the scene, here and later.
         options: options of the refinement; default :class:`RefineOptions`.
-        observe: called after every step.
+        observe: called after every step with the number of steps, the share of the refinement that is done, and the
+            mean PSNR of the last 20 steps in dB.
         clock: returns the time in seconds.
 
     Raises:
@@ -149,32 +109,34 @@ class _Refinement:
         start = gaussians
         if options.min_views:
             start = supported(gaussians, cameras, seen.depth, options.min_views, options.merge_cells)
-        self.limit = int(options.max_growth * len(start))
         self.depth = _median_depth(start, cameras, seen)
         self.pixel = 1 / float(cameras.intrinsics[..., [0, 1], [0, 1]].mean())
-        ones = torch.ones_like(seen.images[:, :, 0, 0])
         self.given, self.start = (
-            RefinedScene(_with_degree(each, options.sh_degree), cameras, ones, torch.zeros_like(ones)).detach()
-            for each in (gaussians, start)
+            RefinedScene(_with_degree(each, options.sh_degree), cameras).detach() for each in (gaussians, start)
         )
-        views = torch.arange(len(ones))
+        views = torch.arange(len(seen.images))
         self.given_loss, self.given_psnr = self._score(self.given, views)
         self.start_loss, self.start_psnr = self._score(self.start, views)
         self.best, self.best_score, self.best_step = self.start, 1.0, 0
         self.scores: list[float] = []
-        self.checks: list[Check] = []
         self.recent: list[float] = []
         self.factor, self.retreats, self.steps = 1.0, 0, 0
-        self.parameters = self._parameters(self._filled())
+        begun = self.start
+        if options.fill:
+            room = int(options.max_growth * len(start)) - len(start)
+            filled = fill_holes(begun.gaussians, cameras, seen, renderer, self.trained, options.fill, room)
+            begun = replace(begun, gaussians=filled)
+        self.parameters = self._parameters(begun)
 
-    def run(self, observe: Callable[[Progress], None] | None) -> Refined:
+    def run(self, observe: Callable[[int, float, float], None] | None) -> Refined:
         """Runs steps and checks until the refinement ends."""
         ended = ""
         try:
             while not ended:
                 ended = self._step()
                 if observe is not None:
-                    observe(self._progress())
+                    recent = self.recent[-20:]
+                    observe(self.steps, self._done(), sum(recent) / len(recent))
         except KeyboardInterrupt:
             ended = "interrupted"
         loss, after = self._score(self.best, torch.arange(len(self.seen.images)))
@@ -197,41 +159,22 @@ class _Refinement:
             psnr=torch.stack((self.given_psnr, after)),
             trained=self.order.trained,
             held_out=self.order.held_out,
-            checks=tuple(self.checks),
             retreats=self.retreats,
         )
 
-    def _filled(self) -> RefinedScene:
-        """Returns the initial state with its holes filled."""
-        if not self.options.fill:
-            return self.start
-        start, side, room = self.start, self.options.fill, self.limit - len(self.start.gaussians)
-        filled = fill_holes(start.gaussians, start.cameras, self.seen, self.renderer, self.trained, side, room)
-        return replace(start, gaussians=filled)
-
     def _parameters(self, scene: RefinedScene) -> Parameters:
-        return Parameters(scene, self.options.rates, self.pixel, self.depth, self.trained)
+        return Parameters(scene, self.options.rates, self.pixel, self.depth)
 
     def _done(self) -> float:
         return self.options.done(self.steps, self.clock() - self.began)
-
-    def _progress(self) -> Progress:
-        recent = self.recent[-20:]
-        return Progress(
-            self.steps,
-            self._done(),
-            sum(recent) / max(len(recent), 1),
-            len(self.parameters.origin),
-            lambda: self.parameters.scene().detach(),
-        )
 
     def _step(self) -> str:
         """Runs one step, and a check if one is due; returns how the refinement ended, or an empty string."""
         views = self.order.deal(self.options.views_per_step).to(self.seen.images.device)
         scene = self.parameters.scene()
         loss, images = self._loss(scene, views)
-        if terms := self.options.loss.of_gaussians(scene.gaussians, self.parameters.size):
-            loss = loss + self.options.loss.total(terms)
+        if self.options.loss.opacity:
+            loss = loss + self.options.loss.opacity * scene.gaussians.opacities.mean()
         self.recent.append(float(images.mean()))
         self.steps += 1
         rate = self.factor * self.options.final_rate ** self._done()
@@ -243,7 +186,7 @@ class _Refinement:
         if trouble := self._check():
             return self._retreat(trouble)
         if done < 1:
-            self._change_density(done)
+            prune(self.parameters, self.options.prune_opacity)
             self.order.next_round()
             return ""
         return "steps" if self.steps == self.options.steps else "seconds"
@@ -252,7 +195,7 @@ class _Refinement:
         """Returns the loss of some views, and their PSNR ``[R]``."""
         loss, cameras, seen = self.options.loss, scene.cameras.select(views), self.seen.views(views)
         rendered = self.trainer(scene.gaussians, cameras)
-        color = where_it_counts(scene.exposed(rendered.color, views)[0], seen.images, seen.mask)
+        color = where_it_counts(rendered.color[0], seen.images, seen.mask)
         rendered = replace(rendered, color=color[None])
         terms = loss.of_views(rendered, cameras, seen, self.depth)
         return loss.total(terms), psnr(rendered.color[0].detach(), seen.images)
@@ -277,20 +220,9 @@ class _Refinement:
                 return f"the loss of the left-out views is {score:.1f} times the initial one"
         self.scores = [*self.scores, score][-SMOOTH:]
         smooth = sum(self.scores) / len(self.scores)
-        since = self.recent[-self.options.check_every :]
-        seconds = self.clock() - self.began
-        self.checks.append(Check(self.steps, seconds, smooth, sum(since) / len(since), len(scene.gaussians)))
         if smooth <= self.best_score:
             self.best, self.best_score, self.best_step = scene, smooth, self.steps
         return ""
-
-    def _change_density(self, done: float) -> None:
-        options = self.options
-        prune(self.parameters, options.prune_opacity)
-        room = self.limit - len(self.parameters.origin)
-        count = min(room, int(options.split_share * len(self.parameters.origin)))
-        if count > 0 and done < 0.5:
-            split(self.parameters, count)
 
     def _retreat(self, trouble: str) -> str:
         """Returns to the best state with half the rates, or ends the refinement after too many retreats."""
@@ -305,6 +237,55 @@ class _Refinement:
         self.parameters = self._parameters(self.best)
         self.scores = []
         return ""
+
+
+class ViewOrder:
+    """Deals views in random order, each once before any repeats; some are left out, in rotation.
+
+    Args:
+        views: number of views.
+        holdout: never deal every N-th view; None: deal all.
+        seed: random seed of the order.
+
+    Attributes:
+        trained: ``[N]`` views that are dealt.
+        held_out: ``[V - N]`` views that are never dealt.
+    """
+
+    def __init__(self, views: int, holdout: int | None, seed: int) -> None:
+        every = torch.arange(views)
+        last = torch.zeros(views, dtype=torch.bool) if holdout is None else every % holdout == holdout - 1
+        self.trained, self.held_out = every[~last], every[last]
+        self._generator = torch.Generator().manual_seed(seed)
+        self._left_out = self._rotation()
+        self._hand: list[int] = []
+        self.next_round()
+
+    def next_round(self) -> None:
+        """Moves on to the next views to leave out."""
+        self.left_out = next(self._left_out)
+
+    def deal(self, count: int) -> Tensor:
+        """Returns the next views, at most ``count`` different ones, sorted."""
+        hidden = set(self.left_out.tolist())
+        count = min(count, len(self.trained) - len(hidden))
+        dealt: list[int] = []
+        while len(dealt) < count:
+            if not self._hand:
+                order = torch.randperm(len(self.trained), generator=self._generator)
+                self._hand = self.trained[order].tolist()
+            view = self._hand.pop()
+            if view not in hidden and view not in dealt:
+                dealt.append(view)
+        return torch.tensor(sorted(dealt))
+
+    def _rotation(self) -> Iterator[Tensor]:
+        if len(self.trained) < FEWEST:
+            while True:
+                yield self.trained[:0]
+        order = self.trained[torch.randperm(len(self.trained), generator=self._generator)]
+        while True:
+            yield from order.split(-(-len(order) // LEFT_OUT))
 
 
 def _check(gaussians: Gaussians, cameras: Cameras, seen: Observations) -> None:

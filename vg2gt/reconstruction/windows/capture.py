@@ -95,7 +95,7 @@ class Capture:
         self._source = source_of(pictures)
         self.images = store.array("images", (count, 3, *size))
         intrinsics = []
-        with monitor.measure("load images") as show:
+        with monitor.stage("load images", -(-count // _AT_ONCE)) as advance:
             for first in range(0, count, _AT_ONCE):
                 name = f"loaded-{first:06d}"
                 found = store.load(name)
@@ -103,7 +103,7 @@ class Capture:
                     found = self._read(slice(first, min(first + _AT_ONCE, count)), size)
                     store.save(name, found)
                 intrinsics.append(found["intrinsics"])
-                show(min(first + _AT_ONCE, count) / count, f"{min(first + _AT_ONCE, count)} of {count}")
+                advance()
         self.mask = store.array("mask") if store.has("mask") else None
         self._depth = store.array("given_depth") if store.has("given_depth") else None
         self.given: Cameras | None = None

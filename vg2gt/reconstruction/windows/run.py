@@ -20,16 +20,20 @@ from vg2gt.method.additions.visibility.check import choose_partners
 from vg2gt.method.fine import FineModule
 from vg2gt.method.grid import scene_voxel_size
 from vg2gt.model import VG2GT, Reconstructor, background_sums
-from vg2gt.reconstruction.inputs import Views
+from vg2gt.reconstruction.inputs import Views, thumbnails, working_order
 from vg2gt.reconstruction.monitor import Monitor
-from vg2gt.reconstruction.order import thumbnails, working_order
 from vg2gt.reconstruction.pictures import Picture
 from vg2gt.reconstruction.windows.capture import Capture, Window, cut
-from vg2gt.reconstruction.windows.merging import as_tensors, merge_windows
-from vg2gt.reconstruction.windows.placement import Placement, moves_onto, place_found
-from vg2gt.reconstruction.windows.pose_graph import Found, closes, loop_candidates, place_windows
-from vg2gt.reconstruction.windows.sets import Anchor, finished_sets
-from vg2gt.reconstruction.windows.store import WindowStore, key_of
+from vg2gt.reconstruction.windows.placement import (
+    Found,
+    Placement,
+    closes,
+    loop_candidates,
+    moves_onto,
+    place_found,
+    place_windows,
+)
+from vg2gt.reconstruction.windows.store import Anchor, WindowStore, finished_sets, key_of, merge_windows
 from vg2gt.types import Cameras, Gaussians, Geometry, Hints, Tokens
 
 TOKEN_BYTES = 4e9  # maximum size of all windows' tokens on disk; if larger, the backbone runs a second time instead
@@ -48,6 +52,11 @@ def window_model(model: Reconstructor) -> VG2GT:
     if isinstance(model, VG2GT) and isinstance(model.fine, FineModule):
         return model
     raise ValueError(f"{type(model).__name__} reconstructs all views at once: add --window 0, or take fewer views")
+
+
+def device_of(model: Reconstructor) -> torch.device:
+    """Returns the device of a model's parameters; the CPU if it has none."""
+    return next((parameter.device for parameter in model.parameters()), torch.device("cpu"))
 
 
 class WindowRun:
@@ -76,7 +85,7 @@ class WindowRun:
         self.model, self.monitor, self.count, self.folder = model, monitor, len(pictures), folder
         self.anchor = anchor
         self.fine = cast(FineModule, model.fine)
-        self.device = next((parameter.device for parameter in model.parameters()), torch.device("cpu"))
+        self.device = device_of(model)
         self.store = WindowStore(folder, set_key(model, pictures, size, window, anchor))
         self.capture = Capture(self.store, pictures, size, monitor)
         self.windows = cut(len(pictures), window)
@@ -89,7 +98,8 @@ class WindowRun:
         surveyed, anchor = self.survey(), self.anchor
         placement = self._placement(surveyed)
         # windows' units to the placement's unit: [V, H, W]
-        metres = torch.cat([each["scale"] for each in surveyed]) / placement.scales[self._firsts()]
+        metres = torch.cat([each["scale"] for each in surveyed])
+        metres = metres / placement.scales[[rows.start for rows in self._blocks()]]
         for rows in self._blocks():
             self.depth[rows] = self.raw[rows] * placement.scales[rows, None, None]
         if anchor is None:
@@ -121,17 +131,14 @@ class WindowRun:
         capture = self.capture
         names = tuple(picture.name for picture in capture.pictures)
         hints = Hints(frame_ids=torch.arange(self.count)[None])
-        return Views(capture.images, names, (), hints, capture.mask, tuple(capture.pictures))
+        return Views(capture.images, names, hints, capture.mask, tuple(capture.pictures))
 
     def _blocks(self) -> list[slice]:
         return [window.own for window in self.windows]
 
-    def _firsts(self) -> list[int]:
-        return [window.own.start for window in self.windows]
-
     def survey(self) -> list[dict[str, Tensor]]:
         """Computes the depth of all views in their windows' units; returns what is needed to place each window."""
-        with self.monitor.measure("windows") as show:
+        with self.monitor.stage("windows", len(self.windows)) as advance:
             found = []
             for number, window in enumerate(self.windows):
                 name = f"window-{number:06d}"
@@ -145,7 +152,7 @@ class WindowRun:
                     known = _summary(window.views, tokens, geometry)
                     self.store.save(name, known)
                 found.append(known)
-                show((number + 1) / len(self.windows), f"{number + 1} of {len(self.windows)}")
+                advance()
         return found
 
     def loops(self, surveyed: Sequence[dict[str, Tensor]]) -> list[Found]:
@@ -155,7 +162,7 @@ class WindowRun:
         alike = (thumbnails(self.capture.images), torch.cat(rows))
         pairs = list(dict.fromkeys(p for described in alike for p in loop_candidates(described, self._blocks(), each)))
         half, found = len(self.windows[0].views) // 2, []
-        with self.monitor.measure("close loops") as show:
+        with self.monitor.stage("close loops", len(pairs)) as advance:
             for number, pair in enumerate(pairs):
                 firsts = [min(max(view - half // 2, 0), self.count - half) for view in pair]
                 views = torch.cat([torch.arange(first, first + half) for first in firsts])
@@ -166,7 +173,7 @@ class WindowRun:
                 loop = found_of(known)
                 if closes(loop, (torch.arange(half), torch.arange(half, 2 * half))):
                     found.append(loop)
-                show((number + 1) / len(pairs), f"{number + 1} of {len(pairs)}")
+                advance()
         return found
 
     def _enhanced(self, views: Tensor) -> tuple[Tokens, Geometry]:
@@ -216,13 +223,11 @@ class WindowRun:
         check, coarsen, fine = self.model.visibility, None, self.fine
         if check is not None:
             masks = (self.store.array("kept", self.depth.shape), self.store.array("kept_next", self.depth.shape))
-            steps = check.rounds * len(self.windows)
-            with self.monitor.measure("views check views") as show:
+            with self.monitor.stage("views check views", check.rounds * len(self.windows)) as advance:
                 partners = choose_partners(self.depth, geometry.cameras, check.partners)
                 coarsen = coarsening(check, self.depth, geometry.cameras, partners)
-                blocks = check_blocks(check, self.depth, geometry.cameras, partners, self._blocks(), masks)
-                for step, _ in enumerate(blocks):
-                    show((step + 1) / steps, f"{step + 1} of {steps}")
+                for _ in check_blocks(check, self.depth, geometry.cameras, partners, self._blocks(), masks):
+                    advance()
             for rows in self._blocks():
                 self.depth[rows] *= masks[0][rows]
         return scene_voxel_size(_sampled(geometry), fine.voxel_size, fine.min_footprint, coarsen)
@@ -231,7 +236,7 @@ class WindowRun:
         sums = [background_sums(self.capture.images[None, rows], self.raw[None, rows]) for rows in self._blocks()]
         total, weight = (torch.stack(parts).sum(0) for parts in zip(*sums, strict=True))
         self.store.save("background", {"total": total, "weight": weight})
-        with self.monitor.measure("fine voxels") as show:
+        with self.monitor.stage("fine voxels", len(self.windows)) as advance:
             for number, window in enumerate(self.windows):
                 name = f"voxels-{number:06d}"
                 if not self.store.has(name):
@@ -244,8 +249,8 @@ class WindowRun:
                     images = self.capture.images[None, window.own].to(self.device)
                     with half_precision_on_gpu(images):
                         pooled = self.fine.pool(self._tokens(number, window), part, images, size.to(self.device))
-                    self.store.save(name, as_tensors(pooled))
-                show((number + 1) / len(self.windows), f"{number + 1} of {len(self.windows)}")
+                    self.store.save(name, {key: value for key, value in vars(pooled).items() if value is not None})
+                advance()
 
 
 @torch.no_grad()
@@ -268,9 +273,8 @@ def gaussians_of(
     """
     sets = [place for place in finished_sets(folder) if place != left_out]
     files = [file for place in sets for file in sorted(place.glob("voxels-*"))]
-    with monitor.measure("merge voxels") as show:
-        pooled = merge_windows(files, lambda done: show(done, "of all windows"))
-    device = next((parameter.device for parameter in model.parameters()), torch.device("cpu"))
+    pooled = merge_windows(files, monitor)
+    device = device_of(model)
     note_sizes({"voxels": len(pooled)})
     with monitor.stage("Gaussians"), half_precision_on_gpu(torch.empty(0, device=device)):
         voxels = cast(FineModule, model.fine).refine(
@@ -288,7 +292,11 @@ def set_key(
     model: VG2GT, pictures: Sequence[Picture], size: tuple[int, int], window: int, anchor: Anchor | None = None
 ) -> str:
     """Returns the key of a set of pictures for this model, working and window size, and anchor of a scene."""
-    files = [[p.name, p.size, p.source, *_state(p)] for p in pictures]
+    states = [None if picture.path is None else picture.path.stat() for picture in pictures]
+    files = [
+        [picture.name, picture.size, picture.source, *([] if state is None else [state.st_size, state.st_mtime_ns])]
+        for picture, state in zip(pictures, states, strict=True)
+    ]
     return key_of(model, files, size, window, None if anchor is None else anchor.plain())
 
 
@@ -313,12 +321,6 @@ def found_of(known: dict[str, Tensor]) -> Found:
     shifted = crop_intrinsics(known["intrinsics"], REDUCED // 2, REDUCED // 2)
     sampled = torch.cat((shifted[..., :2, :] / REDUCED, shifted[..., 2:, :]), -2)
     return Found(known["views"], Cameras(known["poses"], sampled, size), known["depth"], known["intrinsics"])
-
-
-def _state(picture: Picture) -> list[int]:
-    """Returns size and modification time of the picture's file; empty if it has none."""
-    state = None if picture.path is None else picture.path.stat()
-    return [] if state is None else [state.st_size, state.st_mtime_ns]
 
 
 def _sampled(geometry: Geometry) -> Geometry:
