@@ -28,8 +28,5 @@ def test_interpolation_passes_through_the_cameras() -> None:
     assert max(jumps) < 0.8
     (middle,) = interpolate([_camera(0), _camera(2, 0.5)], 1)[1:2]
     assert np.allclose(np.linalg.inv(middle.world_to_camera), np.linalg.inv(_camera(1, 0.25).world_to_camera))
-
-
-def test_what_no_path_can_be_made_of() -> None:
     with pytest.raises(ValueError, match="at least two"):
         interpolate([_camera(0)], 2)

@@ -63,7 +63,15 @@ def pictures_for(
         ValueError: if there are no pictures, the requested cameras are not available, or the backbone takes none.
     """
     backend = model.backend
-    _check(model, poses)
+    if poses not in get_args(Poses):
+        raise ValueError(f"poses is {poses!r}; choose one of {', '.join(get_args(Poses))}")
+    if poses != "auto" and not backend.needs_hints:
+        raise ValueError(
+            f"backend {backend.name} predicts its own cameras and accepts none: omit --poses, or use a backend that "
+            "accepts them, such as backend=da3_small backend.given_poses=true"
+        )
+    if poses == "sfm" and backend.needs_depth:
+        raise ValueError(f"backend {backend.name} works from the depth and poses of a recording; leave --poses out")
     if not backend.needs_hints:
         yield without_copies(find_pictures(images, max_images))
         return
@@ -122,16 +130,3 @@ def _no_depth(backend: str, images: ImagesLike) -> str:
         "only (depth/ next to images/, with poses.txt and K.txt). For photographs, omit backend= and --ckpt (uses the "
         "built-in plane sweep), or use backend=da3_small; a checkpoint only works with the backend it was trained on"
     )
-
-
-def _check(model: Reconstructor, poses: str) -> None:
-    backend = model.backend
-    if poses not in get_args(Poses):
-        raise ValueError(f"poses is {poses!r}; choose one of {', '.join(get_args(Poses))}")
-    if poses in ("given", "sfm") and not backend.needs_hints:
-        raise ValueError(
-            f"backend {backend.name} predicts its own cameras and accepts none: omit --poses, or use a backend that "
-            "accepts them, such as backend=da3_small backend.given_poses=true"
-        )
-    if poses == "sfm" and backend.needs_depth:
-        raise ValueError(f"backend {backend.name} works from the depth and poses of a recording; leave --poses out")

@@ -82,16 +82,13 @@ class ExportedViews:
             (own,) = np.nonzero(seen)
             rows.append(own)
             views.append(np.full(len(own), view))
-            pixels.append(self._in_image(place[0, 0].numpy()[own], view, small))
+            # from pixels of the working size to those of the exported image
+            before, after = small.intrinsics[0, view].numpy(), self.cameras.intrinsics[0, view].numpy()
+            directions = (place[0, 0].numpy()[own] - before[:2, 2]) / before[[0, 1], [0, 1]]
+            pixels.append(directions * after[[0, 1], [0, 1]] + after[:2, 2])
         owner, view, pixel = np.concatenate(rows), np.concatenate(views), np.concatenate(pixels)
         kept = _fewer(owner, view == points.views[owner])
         return owner[kept], view[kept], pixel[kept]
-
-    def _in_image(self, pixels: NDArray[np.float64], view: int, small: Cameras) -> NDArray[np.float64]:
-        """Converts pixels of the working size to pixels of the exported image."""
-        before, after = small.intrinsics[0, view].numpy(), self.cameras.intrinsics[0, view].numpy()
-        directions = (pixels - before[:2, 2]) / before[[0, 1], [0, 1]]
-        return directions * after[[0, 1], [0, 1]] + after[:2, 2]
 
 
 def exported_views(scene: Scene) -> ExportedViews:

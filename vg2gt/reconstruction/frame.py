@@ -77,7 +77,16 @@ def move_to_target(frame: SceneFrame, cameras: Cameras, depth: float) -> tuple[S
     """
     move = np.eye(4)
     if frame.target == "given":
-        move = _near_origin(frame.to_source.copy(), frame.scale * depth)
+        move = frame.to_source.copy()
+        far = float(np.linalg.norm(move[:3, 3])) / (frame.scale * depth)
+        if far > FAR:  # float32 cannot hold such a shift, such as map coordinates
+            offset = move[:3, 3].round()
+            log.warning(
+                "the given cameras are %.3g scene depths from their origin, too far for single precision: the scene is "
+                "written shifted by %s; cameras.json contains the similarity transform to the given frame",
+                far, (-offset).tolist(),
+            )  # fmt: skip
+            move[:3, 3] -= offset
     else:
         move[:3, :3] = upright_rotation(cameras.world_to_camera[0].detach().cpu().double().numpy())
     return replace(frame, name=frame.target, to_source=frame.to_source @ np.linalg.inv(move)), similarity_of(move)
@@ -134,20 +143,6 @@ def moved_cameras(cameras: Cameras, move: Similarity, frame: SceneFrame) -> tupl
             poses = given
     moved = poses.to(cameras.world_to_camera.device, cameras.world_to_camera.dtype)
     return replace(cameras, world_to_camera=moved[None]), poses
-
-
-def _near_origin(move: NDArray[np.float64], depth: float) -> NDArray[np.float64]:
-    """Removes a shift that float32 cannot hold, such as map coordinates, with a warning."""
-    far = float(np.linalg.norm(move[:3, 3]))
-    if far > FAR * depth:
-        offset = move[:3, 3].round()
-        log.warning(
-            "the given cameras are %.3g scene depths from their origin, too far for single precision: the scene is "
-            "written shifted by %s; cameras.json contains the similarity transform to the given frame",
-            far / depth, (-offset).tolist(),
-        )  # fmt: skip
-        move[:3, 3] -= offset
-    return move
 
 
 def similarity_of(matrix: NDArray[np.float64]) -> Similarity:
