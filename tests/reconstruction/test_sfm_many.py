@@ -1,4 +1,4 @@
-"""Structure from motion of many photographs, of copies, and of what cannot be solved."""
+"""Structure from motion of many photographs, of parts, of copies, and of what cannot be solved."""
 
 import json
 import shutil
@@ -82,7 +82,7 @@ def test_a_camera_that_only_turns_is_refused_and_nothing_is_kept(shared: Path, t
     assert not (tmp_path / "sfm").exists()
 
 
-def test_copies_count_once(photos: Path, tmp_path: Path, monkeypatch, caplog) -> None:
+def test_copies_count_once_and_parts_are_named(photos: Path, tmp_path: Path, monkeypatch, caplog) -> None:
     """By a finished folder of four photographs, of which three were placed."""
     kept, names = tmp_path / "sfm", [picture.name for picture in find_pictures(photos)]
     images = {f"{number:06d}.jpg": name for number, name in enumerate(names[:3])}
@@ -91,7 +91,7 @@ def test_copies_count_once(photos: Path, tmp_path: Path, monkeypatch, caplog) ->
         (kept / file).parent.mkdir(parents=True, exist_ok=True)
         (kept / file).touch()
     state = {"key": sfm._key(find_pictures(photos)), "images": images, "points": 100}
-    (kept / "sfm.json").write_text(json.dumps(state | {"left_out": names[3:]}))
+    (kept / "sfm.json").write_text(json.dumps(state | {"left_out": names[3:], "other_parts": [names[3:]]}))
     monkeypatch.setattr(sfm, "_solve", lambda *_: pytest.fail("computed again"))
     monkeypatch.setattr(sfm, "recording_pictures", lambda _: [])
     (tmp_path / "more").mkdir()
@@ -99,18 +99,20 @@ def test_copies_count_once(photos: Path, tmp_path: Path, monkeypatch, caplog) ->
     sfm.find_cameras(find_pictures([photos, tmp_path / "more"]), kept, Monitor())
     assert "1 images are copies of others and are left out: same (as IMG_9)" in caplog.text
     assert "1 of 4 images overlap too little with the others" in caplog.text
+    assert "1 of them form a separate part with no overlap with the 3 images used" in caplog.text
+    assert "reconstruct that part separately: IMG_11" in caplog.text
 
 
-def test_the_largest_model_with_points_is_taken(tmp_path: Path, monkeypatch) -> None:
+def test_the_largest_model_with_points_comes_first(tmp_path: Path, monkeypatch) -> None:
     pycolmap = pytest.importorskip("pycolmap")
     empty, small, large = (
         SimpleNamespace(num_points3D=lambda points=points: points, num_reg_images=lambda placed=placed: placed)
         for points, placed in ((0, 8), (500, 2), (90, 3))
     )
-    for folder, models, taken in (("a", [empty, small, large], large), ("b", [empty], None)):
+    for folder, models, taken in (("a", [empty, small, large], [large, small]), ("b", [empty], [])):
         monkeypatch.setattr(pycolmap, "incremental_mapping", lambda *_, m=models, **__: dict(enumerate(m)))
         (tmp_path / folder).mkdir()
-        assert sfm._map(tmp_path / folder, 8, Monitor()) is taken
+        assert sfm._map(tmp_path / folder, 8, Monitor()) == taken
 
 
 @pytest.mark.slow
@@ -125,9 +127,9 @@ def test_turned_photographs_are_placed(shared: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_larger_of_two_scenes_is_taken(shared: Path, tmp_path: Path, caplog) -> None:
+def test_the_larger_of_two_scenes_is_taken_and_the_other_named(shared: Path, tmp_path: Path, caplog) -> None:
     pytest.importorskip("pycolmap")
     fox = sorted((shared / "data" / "ingp_fox" / "images").iterdir())[:10]
     pictures = sfm.find_cameras(find_pictures([*fox, *office_photos(shared, 14)]), tmp_path / "sfm", Monitor())
     assert [picture.name for picture in pictures] == [path.stem for path in office_photos(shared, 14)]
-    assert "10 of 24 images overlap too little with the others" in caplog.text
+    assert "10 of them form a separate part with no overlap with the 14 images used" in caplog.text

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from tests.refinement.conftest import Start
+from tests.refinement.conftest import VIEWS, Start
 from vg2gt.geometry.cameras import invert_rigid
 from vg2gt.refinement import RefinedScene, RefineLoss, RefineRates
 from vg2gt.refinement.density import prune
@@ -19,7 +19,9 @@ PIXEL, DEPTH = 0.01, 2.0
 
 @pytest.fixture
 def parameters(start: Start) -> Parameters:
-    return Parameters(RefinedScene(start.gaussians, start.cameras), RefineRates(), PIXEL, DEPTH)
+    ones = torch.ones(VIEWS, 3)
+    state = RefinedScene(start.gaussians, start.cameras, ones, torch.zeros_like(ones))
+    return Parameters(state, RefineRates(), PIXEL, DEPTH, torch.arange(VIEWS))
 
 
 def test_parameters_begin_with_the_scene(parameters: Parameters, start: Start) -> None:
@@ -118,7 +120,10 @@ def test_a_perfect_view_has_no_loss(start: Start) -> None:
     assert float(moved) == pytest.approx(float((0.05 * rendered.depth[0] * trust).sum() / trust.sum()), rel=1e-3)
 
 
-def test_terms_are_weighted() -> None:
-    terms = {"color_l1": torch.tensor(0.5), "ssim": torch.tensor(0.25)}
-    assert float(RefineLoss(color_l1=2, ssim=4).total(terms)) == 2
+def test_weights_decide_which_terms_there_are(start: Start) -> None:
+    size = start.gaussians.scales.max(-1).values
+    assert RefineLoss().of_gaussians(start.gaussians, size) == {}
+    terms = RefineLoss(opacity=0.1, scale=2.0).of_gaussians(start.gaussians, size / 2)
+    assert float(terms["scale"]) == pytest.approx(1.0)
+    assert float(RefineLoss(opacity=0.1, scale=2.0).total(terms)) == pytest.approx(2 + 0.1 * float(terms["opacity"]))
     assert not RefineLoss(depth_consistency=0, normal_render=0, normal_decoded=0).needs_geometry

@@ -112,6 +112,12 @@ def find_cameras(pictures: Sequence[Picture], folder: Path, monitor: Monitor) ->
             "%d of %d images overlap too little with the others; they have no cameras and are left out: %s",
             len(state["left_out"]), len(pictures), ", ".join(state["left_out"]),
         )  # fmt: skip
+    for part in state.get("other_parts", []):
+        log.warning(
+            "%d of them form a separate part with no overlap with the %d images used; take photographs in between, or "
+            "reconstruct that part separately: %s",
+            len(part), len(state["images"]), ", ".join(part),
+        )  # fmt: skip
     names = state["images"]
     source = f"{SFM_SOURCE}, {len(names)} of {len(pictures)} images"
     paths = {picture.name: picture.path for picture in pictures}
@@ -159,20 +165,21 @@ def _solve(pictures: Sequence[Picture], folder: Path, key: str, monitor: Monitor
         names = sorted(name for members in lenses.values() for name in members)
         _find_features(work, lenses, names, monitor)
         _match(work, names, monitor)
-        model = _map(work, len(names), monitor)
-        if model is None:
+        models = _map(work, len(names), monitor)
+        if not models:
             raise ValueError(
                 f"cannot find the cameras of these {len(pictures)} images: too few overlap, taken from nearby but "
                 f"different positions; {ADVICE}"
             )
-        placed = {image.name for image in model.images.values() if image.has_pose}
-        _write(model, work)
+        placed, *parts = map(_placed, models)
+        _write(models[0], work)
         titles = {name: picture.name for name, picture in zip(names, pictures, strict=True)}
         state = {
             "key": key,
             "images": {name: title for name, title in titles.items() if name in placed},
             "left_out": [title for name, title in titles.items() if name not in placed],
-            "points": model.num_points3D(),
+            "other_parts": [[titles[name] for name in sorted(part - placed)] for part in parts if part - placed],
+            "points": models[0].num_points3D(),
         }
         with whole_folder(folder) as staged:
             for part in ("images", "sparse"):
@@ -284,8 +291,8 @@ def _match(work: Path, names: Sequence[str], monitor: Monitor) -> None:
             advance()
 
 
-def _map(work: Path, count: int, monitor: Monitor) -> Reconstruction | None:
-    """Returns the model with most images that COLMAP's incremental mapper finds; None if none has enough points.
+def _map(work: Path, count: int, monitor: Monitor) -> list[Reconstruction]:
+    """Returns the models with enough points that COLMAP's incremental mapper finds, the one with most images first.
 
     The global mapper (``pycolmap.global_mapping``) is not used: on the fox scene it places all 24 photographs with a
     small reprojection error, but a quarter of the path away from their positions, even with calibrated focal lengths.
@@ -307,7 +314,11 @@ def _map(work: Path, count: int, monitor: Monitor) -> Reconstruction | None:
             next_image_callback=lambda: advance() if next(expected, None) is not None else None,
         )
     sound = [model for model in models.values() if model.num_points3D() >= FEWEST_POINTS]
-    return max(sound, key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
+    return sorted(sound, key=lambda model: (model.num_reg_images(), model.num_points3D()), reverse=True)
+
+
+def _placed(model: Reconstruction) -> set[str]:
+    return {image.name for image in model.images.values() if image.has_pose}
 
 
 def _descriptors(database: Path, names: Sequence[str]) -> list[NDArray[np.uint8]]:

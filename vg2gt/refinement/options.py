@@ -9,9 +9,8 @@ from torch import Tensor
 
 from vg2gt.geometry.normals import normals_from_depth
 from vg2gt.geometry.spherical_harmonics import MAX_DEGREE
-from vg2gt.losses.gaussian import normal_error, weighted_mean
-from vg2gt.losses.gaussian import structure_loss
-from vg2gt.types import Cameras, Render, TensorRecord
+from vg2gt.losses.gaussian import normal_error, structure_loss, weighted_mean
+from vg2gt.types import Cameras, Gaussians, Render, TensorRecord
 
 RENDERINGS = 12  # of each view, if neither steps nor seconds are set
 MIN_ALPHA = 0.5
@@ -40,7 +39,7 @@ class Observations(TensorRecord):
 
 @dataclass(frozen=True)
 class RefineLoss:
-    """Loss of rendered views, and a weight on the opacity of the Gaussians.
+    """Loss of rendered views and of the Gaussians themselves.
 
     Colour alone roughens surfaces: Gaussians in front of and behind a surface explain a pixel as well. The geometry
     terms hold Gaussians at the decoded depth, weighted by its confidence, and orient them along the surface that they
@@ -53,6 +52,7 @@ class RefineLoss:
         normal_render: weight of ``1 - cos`` between rendered normals and the normals of the rendered depth.
         normal_decoded: weight of ``1 - cos`` between rendered normals and the normals of the decoded depth.
         opacity: weight of the mean opacity, which makes Gaussians that no image needs transparent.
+        scale: weight of the mean growth of each Gaussian's largest side, relative to its initial length.
 
     Raises:
         ValueError: if a weight is negative.
@@ -64,6 +64,7 @@ class RefineLoss:
     normal_render: float = 0.1
     normal_decoded: float = 0.1
     opacity: float = 0.0
+    scale: float = 0.0
 
     def __post_init__(self) -> None:
         _not_negative(self, "loss")
@@ -102,6 +103,15 @@ class RefineLoss:
             terms["normal_decoded"] = normal_error(normal, expected, seen.depth_conf, hits & valid)
         return terms
 
+    def of_gaussians(self, gaussians: Gaussians, size: Tensor) -> dict[str, Tensor]:
+        """Returns the unweighted terms of the Gaussians whose weight is not 0; ``size [G]``: initial largest sides."""
+        terms: dict[str, Tensor] = {}
+        if self.opacity:
+            terms["opacity"] = gaussians.opacities.mean()
+        if self.scale:
+            terms["scale"] = (gaussians.scales.max(-1).values / size - 1).clamp(min=0).mean()
+        return terms
+
     def total(self, terms: dict[str, Tensor]) -> Tensor:
         """Returns the weighted sum of the terms."""
         return torch.stack([getattr(self, name) * value for name, value in terms.items()]).sum()
@@ -125,6 +135,7 @@ class RefineRates:
         sh: of the constant colour coefficient; the higher bands have a twentieth of it (as in 3DGS).
         cameras: of rotations and shifts, in pixels: a rotation by one pixel, or a shift that moves points at the median
             depth by one pixel.
+        exposure: of each view's log gain and bias, one per colour channel.
 
     Raises:
         ValueError: if a rate is negative.
@@ -136,6 +147,7 @@ class RefineRates:
     opacities: float = 0.05
     sh: float = 0.02
     cameras: float = 0.03
+    exposure: float = 0.0
 
     def __post_init__(self) -> None:
         _not_negative(self, "rates")

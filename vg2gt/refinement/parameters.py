@@ -1,4 +1,4 @@
-"""Parameters of a refinement: one scene's Gaussians, and the cameras of its views."""
+"""Parameters of a refinement: one scene's Gaussians, and the cameras and exposures of its views."""
 
 from __future__ import annotations
 
@@ -27,10 +27,14 @@ class RefinedScene(TensorRecord):
     Attributes:
         gaussians: the scene (B = 1).
         cameras: cameras of its V views (B = 1).
+        gain: ``[V, 3]`` factors from rendered colours to those of a view's image.
+        bias: ``[V, 3]`` offsets added after the gain.
     """
 
     gaussians: Gaussians
     cameras: Cameras
+    gain: Tensor
+    bias: Tensor
 
     def seen_from(self, first: Tensor) -> RefinedScene:
         """Returns the same scene, with the same renderings, in the world where view 0 has the pose ``first [4, 4]``."""
@@ -46,7 +50,11 @@ class RefinedScene(TensorRecord):
             sh=rotation_of_coefficients(turn, degree) @ gaussians.sh,
         )
         poses = torch.cat((first[None], compose(found[1:], back)))
-        return RefinedScene(moved, replace(self.cameras, world_to_camera=poses[None]))
+        return replace(self, gaussians=moved, cameras=replace(self.cameras, world_to_camera=poses[None]))
+
+    def exposed(self, color: Tensor, views: Tensor) -> Tensor:
+        """Applies the exposure of the views ``[R]`` to rendered colours ``[1, R, 3, H, W]``."""
+        return color * self.gain[views, :, None, None] + self.bias[views, :, None, None]
 
 
 class Parameters:
@@ -63,14 +71,16 @@ class Parameters:
         pixel: size of a pixel at the scene's median depth relative to that depth: the unit of rotations and, times
             ``depth``, of shifts.
         depth: median depth in scene units.
+        trained: ``[N]`` views to train on; exposures of the others stay fixed.
     """
 
-    def __init__(self, start: RefinedScene, rates: RefineRates, pixel: float, depth: float) -> None:
+    def __init__(self, start: RefinedScene, rates: RefineRates, pixel: float, depth: float, trained: Tensor) -> None:
         gaussians = start.gaussians
         self.start = start
-        self.pixel, self.depth = pixel, depth
+        self.pixel, self.depth, self.trained = pixel, depth, trained
         self.origin = gaussians.means
         self.unit = gaussians.scales.median(-1).values
+        self.size = gaussians.scales.max(-1).values
         self.values = {
             "means": torch.zeros_like(gaussians.means),
             "quats": F.normalize(gaussians.quats, dim=-1),
@@ -78,9 +88,11 @@ class Parameters:
             "opacities": torch.logit(gaussians.opacities.clamp(LOGIT_MARGIN, 1 - LOGIT_MARGIN)),
             "sh": gaussians.sh[:, :1].clone(),
             "sh_rest": gaussians.sh[:, 1:].clone(),
-            "cameras": gaussians.means.new_zeros(start.cameras.world_to_camera.shape[1], 6),
+            "cameras": gaussians.means.new_zeros(len(start.gain), 6),
+            "gain": start.gain.log(),
+            "bias": start.bias.clone(),
         }
-        self.rates = {**vars(rates), "sh_rest": HIGHER_BANDS * rates.sh}
+        self.rates = {**vars(rates), "sh_rest": HIGHER_BANDS * rates.sh, "gain": rates.exposure, "bias": rates.exposure}
         groups = []
         for name, value in self.values.items():
             if self.rates[name] and value.numel():
@@ -99,7 +111,13 @@ class Parameters:
             torch.zeros(len(self.origin), dtype=torch.int64, device=self.origin.device),
             start.gaussians.background,
         )
-        return RefinedScene(gaussians, self._cameras(start.cameras))
+        gain, bias = self._centred(values["gain"]).exp(), self._centred(values["bias"])
+        return RefinedScene(gaussians, self._cameras(start.cameras), gain, bias)
+
+    def _centred(self, exposure: Tensor) -> Tensor:
+        """Returns exposures ``[V, 3]`` minus the mean of the trained views, which the scene's colours represent."""
+        trained = exposure[self.trained]
+        return exposure.index_copy(0, self.trained, trained - trained.mean(0))
 
     def _cameras(self, cameras: Cameras) -> Cameras:
         if not self.rates["cameras"]:
@@ -125,7 +143,7 @@ class Parameters:
     @torch.no_grad()
     def take(self, rows: Tensor) -> None:
         """Keeps the Gaussians ``rows``, in that order and possibly repeated, with their Adam state."""
-        self.origin, self.unit = self.origin[rows], self.unit[rows]
+        self.origin, self.unit, self.size = self.origin[rows], self.unit[rows], self.size[rows]
         groups = {group["name"]: group for group in self.optimizer.param_groups}
         for name in OF_GAUSSIANS:
             before = self.values[name]

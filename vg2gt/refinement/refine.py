@@ -111,10 +111,12 @@ class _Refinement:
             start = supported(gaussians, cameras, seen.depth, options.min_views, options.merge_cells)
         self.depth = _median_depth(start, cameras, seen)
         self.pixel = 1 / float(cameras.intrinsics[..., [0, 1], [0, 1]].mean())
+        ones = torch.ones_like(seen.images[:, :, 0, 0])
         self.given, self.start = (
-            RefinedScene(_with_degree(each, options.sh_degree), cameras).detach() for each in (gaussians, start)
+            RefinedScene(_with_degree(each, options.sh_degree), cameras, ones, torch.zeros_like(ones)).detach()
+            for each in (gaussians, start)
         )
-        views = torch.arange(len(seen.images))
+        views = torch.arange(len(ones))
         self.given_loss, self.given_psnr = self._score(self.given, views)
         self.start_loss, self.start_psnr = self._score(self.start, views)
         self.best, self.best_score, self.best_step = self.start, 1.0, 0
@@ -163,7 +165,7 @@ class _Refinement:
         )
 
     def _parameters(self, scene: RefinedScene) -> Parameters:
-        return Parameters(scene, self.options.rates, self.pixel, self.depth)
+        return Parameters(scene, self.options.rates, self.pixel, self.depth, self.trained)
 
     def _done(self) -> float:
         return self.options.done(self.steps, self.clock() - self.began)
@@ -173,8 +175,8 @@ class _Refinement:
         views = self.order.deal(self.options.views_per_step).to(self.seen.images.device)
         scene = self.parameters.scene()
         loss, images = self._loss(scene, views)
-        if self.options.loss.opacity:
-            loss = loss + self.options.loss.opacity * scene.gaussians.opacities.mean()
+        if terms := self.options.loss.of_gaussians(scene.gaussians, self.parameters.size):
+            loss = loss + self.options.loss.total(terms)
         self.recent.append(float(images.mean()))
         self.steps += 1
         rate = self.factor * self.options.final_rate ** self._done()
@@ -195,7 +197,7 @@ class _Refinement:
         """Returns the loss of some views, and their PSNR ``[R]``."""
         loss, cameras, seen = self.options.loss, scene.cameras.select(views), self.seen.views(views)
         rendered = self.trainer(scene.gaussians, cameras)
-        color = where_it_counts(rendered.color[0], seen.images, seen.mask)
+        color = where_it_counts(scene.exposed(rendered.color, views)[0], seen.images, seen.mask)
         rendered = replace(rendered, color=color[None])
         terms = loss.of_views(rendered, cameras, seen, self.depth)
         return loss.total(terms), psnr(rendered.color[0].detach(), seen.images)
