@@ -61,17 +61,23 @@ def test_colmap_points_fall_on_their_pixels_and_have_tracks(written: Path, scene
     assert len(shown[0] & shown[1]) > 500  # dense stereo finds its source images by common points
 
 
+def cloud(path: Path) -> np.ndarray:
+    points = trimesh.load(path)
+    assert isinstance(points, trimesh.PointCloud)
+    return np.array(points.vertices)
+
+
 def test_nerfstudio(written: Path, scene: Scene) -> None:
     transforms = io.read_transforms(written / "nerfstudio" / "transforms.json")
     for frame, camera in zip(transforms.frames, scene.named_cameras(), strict=True):
         assert (written / "nerfstudio" / frame.file_path).is_file()
         assert np.abs(frame.world_to_camera - camera.world_to_camera).max() < 1e-6
         assert np.abs(frame.lens.intrinsics() - camera.intrinsics).max() < 1e-9
-    assert len(trimesh.load(written / "nerfstudio" / transforms.ply_file_path).vertices) > 5000
+    assert len(cloud(written / "nerfstudio" / transforms.ply_file_path)) > 5000
 
 
 def test_points_and_meshes_lie_on_the_surfaces(written: Path, scene: Scene) -> None:
-    points = np.array(trimesh.load(written / "points.ply").vertices)
+    points = cloud(written / "points.ply")
     for suffix in ("ply", "glb"):
         assert len(trimesh.load_mesh(written / f"mesh.{suffix}").faces) > 1000
     vertices = torch.from_numpy(np.array(trimesh.load_mesh(written / "mesh.ply").vertices)).float()
