@@ -215,8 +215,7 @@ def cpu_suites(quick: bool) -> dict[str, list[Case]]:
     cores = os.cpu_count() or 1
     suites = {
         "implementations": [
-            replace(base, gaussians=1_500, size=(40, 80), sigma=1.2, implementation=name)
-            for name in ("cpu", "torch", "dense")
+            replace(base, gaussians=1_500, size=(40, 80), sigma=1.2, implementation=name) for name in ("cpu", "dense")
         ],
         "outputs": [
             base,
@@ -227,11 +226,6 @@ def cpu_suites(quick: bool) -> dict[str, list[Case]]:
     }
     if quick:
         return suites
-    for count in (20_000, 100_000):
-        sigma = 2.0 if count == 20_000 else 1.0
-        suites["implementations"] += [
-            replace(base, gaussians=count, sigma=sigma, implementation=name) for name in ("cpu", "torch")
-        ]
     suites["Gaussians"] = [replace(base, gaussians=n) for n in (10_000, 30_000, 100_000, 300_000)]
     suites["views"] = [replace(base, gaussians=30_000, views=v) for v in (1, 2, 4, 8)]
     suites["threads"] = [replace(base, views=2, threads=t) for t in sorted({1, 2, cores // 2, cores} - {0})]
@@ -243,9 +237,9 @@ def gpu_suites(quick: bool) -> dict[str, list[Case]]:
     try:
         import gsplat  # noqa: F401  # pyright: ignore[reportMissingImports]
 
-        names = ("triton", "torch", "gsplat")
+        names = ("triton", "gsplat")
     except ImportError:
-        names = ("triton", "torch")
+        names = ("triton",)
     sizes = ((224, 448),) if quick else ((224, 448), (518, 518))
     counts, views = ((100_000,), (1, 8)) if quick else ((100_000, 1_000_000), (1, 8, 18))
     base = Case("triton", 100_000)
@@ -255,7 +249,6 @@ def gpu_suites(quick: bool) -> dict[str, list[Case]]:
             for count in counts
             for number in views
             for name in names
-            if not (name == "torch" and count * number > 1_000_000)
         ]
         for height, width in sizes
     }

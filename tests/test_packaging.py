@@ -17,7 +17,7 @@ from tests.training_helpers import small_config
 from vg2gt.training.loop import build
 
 
-@pytest.mark.parametrize("renderer", ["torch", pytest.param("auto", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("renderer", ["dense", pytest.param("auto", marks=pytest.mark.slow)])
 def test_installed_wheel_trains_from_an_empty_folder(tmp_path: Path, cache: Path, renderer: str) -> None:
     """With kernels in the slow case: they are compiled again for a package in another folder."""
     making = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(tmp_path / "dist"), str(ROOT)]
@@ -40,10 +40,10 @@ def test_installed_wheel_trains_from_an_empty_folder(tmp_path: Path, cache: Path
     subprocess.run([*install, "--target", str(site), str(wheel)], check=True, capture_output=True)
     # -S and an explicit path keep the checkout's editable install out.
     paths = [str(site), *(path for path in sys.path if path.endswith("site-packages"))]
-    rooms = cache if renderer == "torch" else tmp_path / "rooms"
+    rooms = cache if renderer == "dense" else tmp_path / "rooms"
     small = ["debug=fast_dev_run", "data.image_size=[28,56]", "data.train_scenes=1", "data.eval_scenes=1"]
     small += [f"renderer.implementation={renderer}", f"data.cache_dir={rooms}"]
-    if renderer == "torch":
+    if renderer == "dense":
         data = build(small_config(tmp_path / "here", rooms, *small)).datamodule
         data.setup("fit")
         for loader in (data.train_dataloader(), data.val_dataloader()):

@@ -10,7 +10,7 @@ from torch import Tensor
 from vg2gt.rendering import render
 from vg2gt.types import Cameras, Gaussians, Render
 
-IMPLEMENTATIONS = ("dense", "torch", "cpu")
+IMPLEMENTATIONS = ("dense", "cpu")
 KINDS = (("solid", "median"), ("rasterized", "median"), ("rasterized", "expected"))
 BACKGROUND = (0.3, 0.1, 0.7)
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh")

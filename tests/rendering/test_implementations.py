@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from tests.rendering.scenes import (
+    IMPLEMENTATIONS,
     KINDS,
     PARAMETERS,
     assert_same_render,
@@ -24,28 +25,25 @@ from vg2gt.rendering import cpu_tiles, render
 from vg2gt.rendering.options import DepthKind, Mode
 from vg2gt.rendering.renderer import Implementation
 
-FAST = ("torch", "cpu")
 FIELDS = (*PARAMETERS, "batch")
 
 
 @pytest.mark.parametrize("degree", [0, 2])
 @pytest.mark.parametrize(("mode", "depth"), KINDS)
-@pytest.mark.parametrize("implementation", FAST)
-def test_equals_the_reference(implementation: Implementation, mode: Mode, depth: DepthKind, degree: int) -> None:
+def test_equals_the_reference(mode: Mode, depth: DepthKind, degree: int) -> None:
     gaussians, cameras = soup(50, seed=degree, degree=degree, scenes=2), cameras_around((20, 24), scenes=2)
     options = {"mode": mode, "depth": depth, "bisections": 40}
     expected = render_with_gradients(gaussians, cameras, implementation="dense", **options)
     assert (expected[0].depth > 0).float().mean() > 0.2
-    assert_same_render(render_with_gradients(gaussians, cameras, implementation=implementation, **options), expected)
+    assert_same_render(render_with_gradients(gaussians, cameras, implementation="cpu", **options), expected)
 
 
-@pytest.mark.parametrize("implementation", FAST)
-def test_deep_translucent_rays_equal_the_reference(implementation: Implementation) -> None:
+def test_deep_translucent_rays_equal_the_reference() -> None:
     gaussians = soup(300, size=0.6)
     gaussians = replace(gaussians, opacities=gaussians.opacities * 0.05)
     expected, found = (
         render_with_gradients(gaussians, pinhole((9, 18)), implementation=name, bisections=40)
-        for name in ("dense", implementation)
+        for name in ("dense", "cpu")
     )
     assert_same_render(found, expected)
 
@@ -68,13 +66,12 @@ def test_tiles_with_more_hits_than_there_is_room_for_are_rendered_again(monkeypa
 
 
 @pytest.mark.parametrize("options", [{"near": 2.6}, {"newton_steps": 0}])
-@pytest.mark.parametrize("implementation", FAST)
-def test_the_search_for_the_median_equals_the_reference(implementation, options):
+def test_the_search_for_the_median_equals_the_reference(options):
     """Where Gaussians reach through the near plane, and by bisections alone."""
     gaussians, cameras = soup(80, seed=3, size=0.3), pinhole((20, 24))
     expected, found = (
         render_with_gradients(gaussians, cameras, implementation=name, bisections=45, **options)
-        for name in ("dense", implementation)
+        for name in ("dense", "cpu")
     )
     depth = expected[0].depth
     assert (depth > 0).float().mean() > 0.2
@@ -92,7 +89,7 @@ def test_the_compiled_search_crosses_gaps(opacity: float, dtype: torch.dtype, to
     far = replace(near, means=40 * near.means, scales=near.scales * torch.tensor([40.0, 40.0, 1.0]))
     both = replace(near, **{name: torch.cat((getattr(near, name), getattr(far, name))) for name in FIELDS})
     both = replace(both, opacities=opacity * both.opacities)
-    exact = render(both, cameras, implementation="torch", bisections=60).depth
+    exact = render(both, cameras, implementation="dense", bisections=60).depth
     found = render(floats_to(both, dtype), floats_to(cameras, dtype), implementation="cpu").depth
     there = exact > 0
     assert there.float().mean() > 0.6
@@ -130,7 +127,7 @@ def test_cpu_is_deterministic_for_any_number_of_threads(dtype: torch.dtype) -> N
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 
 
-@pytest.mark.parametrize("implementation", ["dense", *FAST])
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 def test_color_only_changes_nothing_but_what_it_leaves_out(implementation: Implementation) -> None:
     gaussians, cameras = with_gradients(soup(40)), cameras_around((20, 24))
     inputs = [getattr(gaussians, name) for name in PARAMETERS]
@@ -144,7 +141,7 @@ def test_color_only_changes_nothing_but_what_it_leaves_out(implementation: Imple
         torch.testing.assert_close(complete, reduced, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("implementation", ["dense", *FAST])
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 def test_no_gradient_passes_the_alpha_cap(implementation: Implementation) -> None:
     gaussians = soup(1, size=3.0)
     gaussians.means[0] = torch.tensor([0.0, 0.0, 40.0])

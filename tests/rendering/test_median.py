@@ -7,7 +7,7 @@ import torch
 from scipy.optimize import root_scalar
 from torch import Tensor
 
-from vg2gt.rendering.median import MedianDepth, Rays
+from vg2gt.rendering.median import MedianDepth
 from vg2gt.rendering.options import RenderOptions
 
 EXACT = RenderOptions(bisections=60, newton_steps=2, slope_floor=0.0)
@@ -27,7 +27,7 @@ def random_rays(rays: int, hits: int, seed: int = 0) -> tuple[Tensor, Tensor, Te
 
 def solve(alpha: Tensor, peak: Tensor, precision: Tensor, options: RenderOptions = EXACT) -> Tensor:
     before = torch.cumprod(1 - alpha.detach(), -1) / (1 - alpha.detach())
-    depth = MedianDepth.apply(alpha, peak, precision, before, Rays(), options)
+    depth = MedianDepth.apply(alpha, peak, precision, before, options)
     assert isinstance(depth, Tensor)
     return depth
 

@@ -5,8 +5,9 @@ import torch
 from tests.rendering.scenes import cameras_around, pinhole, soup
 from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.kernels.constants import ALPHA_MIN
-from vg2gt.rendering.options import RenderOptions, SceneViews
+from vg2gt.rendering.options import RenderOptions
 from vg2gt.rendering.projection import Splats, project, respond, screen_box
+from vg2gt.rendering.scenes import SceneViews
 from vg2gt.types import Cameras, Gaussians
 
 EXACT = RenderOptions(lowpass=0.0)

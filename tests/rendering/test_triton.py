@@ -112,7 +112,7 @@ def test_the_search_crosses_gaps(dtype: torch.dtype, tolerance: float) -> None:
     far = replace(near, means=40 * near.means, scales=near.scales * torch.tensor([40.0, 40.0, 1.0]))
     both = replace(near, **{name: torch.cat((getattr(near, name), getattr(far, name))) for name in FIELDS})
     both = replace(both, opacities=0.3 * both.opacities)
-    exact = render(both, cameras, implementation="torch", bisections=60).depth
+    exact = render(both, cameras, implementation="dense", bisections=60).depth
     on_device = floats_to(both, dtype).to(DEVICE), floats_to(cameras, dtype).to(DEVICE)
     found = render(*on_device, implementation="triton").depth.cpu()
     there = exact > 0

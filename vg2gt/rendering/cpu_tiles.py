@@ -22,7 +22,8 @@ from vg2gt.kernels.render_cpu.projection_backward import CHUNK, FIELDS, project_
 from vg2gt.kernels.render_cpu.tiles import count_tiles, depth_order, fill_tiles
 from vg2gt.kernels.threads import parallel_for
 from vg2gt.rendering.median import depth_factors
-from vg2gt.rendering.options import Images, RenderOptions, SceneViews
+from vg2gt.rendering.options import RenderOptions
+from vg2gt.rendering.scenes import Images, SceneViews
 
 TILES_PER_ITEM = 8
 HIT_CAPACITY = 192  # hits per block of rays for the depth solver; a tile with more gets a larger buffer
@@ -34,8 +35,7 @@ _local = threading.local()
 
 def rasterize_cpu(scene: SceneViews, options: RenderOptions) -> Images:
     """Renders every view; differentiable in every tensor of the scene."""
-    color, normal, depth, alpha = _Rasterize.apply(*scene.tensors, scene.size, options)
-    return Images(color, normal, depth, alpha)
+    return _Rasterize.apply(*scene.tensors, scene.size, options)  # pyright: ignore[reportReturnType]
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class _Rasterize(torch.autograd.Function):
     """Forward and backward of all views of a scene."""
 
     @staticmethod
-    def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def forward(ctx: Any, *inputs: Any) -> Images:
         """Returns colour and normals ``[V, H, W, 3]``, depth and accumulated opacity ``[V, H, W]``."""
         tensors, (size, options) = inputs[:8], inputs[8:]
         arrays = [_array(tensor) for tensor in tensors]

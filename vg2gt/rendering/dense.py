@@ -7,32 +7,32 @@ from torch import Tensor
 
 from vg2gt.geometry.cameras import pixel_grid
 from vg2gt.kernels.constants import ALPHA_MIN, TRANSMITTANCE_STOP
-from vg2gt.rendering.median import Rays, ray_depth
-from vg2gt.rendering.options import Images, RenderOptions, SceneViews
+from vg2gt.rendering.median import ray_depth
+from vg2gt.rendering.options import RenderOptions
 from vg2gt.rendering.projection import Splats, respond, visible_splats
+from vg2gt.rendering.scenes import Images, SceneViews
 
 CELLS_PER_CHUNK = 1 << 21  # pixels times Gaussians held at once
 
 
 def rasterize_dense(scene: SceneViews, options: RenderOptions) -> Images:
     """Renders every view; differentiable in every tensor of the scene."""
-    return Images.stack([_render_view(scene.view(index), options) for index in range(len(scene.world_to_camera))])
+    views = [_render_view(scene.view(index), options) for index in range(len(scene.world_to_camera))]
+    color, normal, depth, alpha = (torch.stack(parts) for parts in zip(*views, strict=True))
+    return color, normal, depth, alpha
 
 
 def _render_view(scene: SceneViews, options: RenderOptions) -> Images:
     height, width = scene.size
-    splats, _ = visible_splats(scene, options)
+    splats = visible_splats(scene, options)
     pixels = pixel_grid(height, width, like=scene.means).reshape(-1, 2)  # [H * W, 2]
     chunks = pixels.split(max(1, CELLS_PER_CHUNK // max(1, len(splats.depth))))
     parts = [_render_pixels(splats, chunk, scene.background, options) for chunk in chunks]
     color, normal, depth, alpha = (torch.cat(part) for part in zip(*parts, strict=True))
-    shape = (1, height, width)
-    return Images(color.view(*shape, 3), normal.view(*shape, 3), depth.view(shape), alpha.view(shape))
+    return color.view(height, width, 3), normal.view(height, width, 3), depth.view(scene.size), alpha.view(scene.size)
 
 
-def _render_pixels(
-    splats: Splats, pixels: Tensor, background: Tensor, options: RenderOptions
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _render_pixels(splats: Splats, pixels: Tensor, background: Tensor, options: RenderOptions) -> Images:
     """Blends P pixels front to back (paper, eqn 3dgs_render_preliminary; eqn gggs_color with ``G(t*) = alpha``)."""
     response, peak, precision = respond(splats, pixels[:, None])  # [P, N]
     alpha = response.clamp(max=options.alpha_max)
@@ -48,5 +48,5 @@ def _render_pixels(
     normal, depth = torch.zeros_like(color), torch.zeros_like(final)
     if options.geometry and len(splats.depth):
         normal = weight @ splats.normal
-        depth = ray_depth(alpha, weight, before.detach(), final, peak, precision, Rays(), options)
+        depth = ray_depth(alpha, weight, before.detach(), final, peak, precision, options)
     return color, normal, depth, 1 - final

@@ -20,28 +20,8 @@ from vg2gt.rendering.options import RenderOptions
 LOG_HALF = math.log(0.5)
 
 
-class Rays:
-    """Mapping between hits and rays; this one is a dense matrix ``[P, N]``: rows are rays, columns their hits."""
-
-    def sum(self, hits: Tensor) -> Tensor:
-        """Sums over each ray's hits."""
-        return hits.sum(-1)
-
-    def amin(self, hits: Tensor) -> Tensor:
-        """Minimum over each ray's hits; inf for rays without hits."""
-        return hits.amin(-1)
-
-    def amax(self, hits: Tensor) -> Tensor:
-        """Maximum over each ray's hits; -inf for rays without hits."""
-        return hits.amax(-1)
-
-    def expand(self, rays: Tensor) -> Tensor:
-        """Repeats one value per ray for each of its hits."""
-        return rays[:, None]
-
-
 def log_transmittance(t: Tensor, alpha: Tensor, peak: Tensor, precision: Tensor) -> Tensor:
-    """Returns each hit's term of ``ln T(t)`` (paper, eqns volume_render and vacancy); one value per hit throughout."""
+    """Returns each hit's term of ``ln T(t)`` (paper, eqns volume_render and vacancy); ``[P, N]``."""
     occupied = torch.log1p(-alpha * torch.exp(-0.5 * precision * (t - peak) ** 2))
     return torch.where(t <= peak, 0.5 * occupied, torch.log1p(-alpha) - 0.5 * occupied)
 
@@ -57,34 +37,33 @@ class MedianDepth(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, alpha: Tensor, peak: Tensor, precision: Tensor, before: Tensor, rays: Rays, options: RenderOptions
+        ctx: Any, alpha: Tensor, peak: Tensor, precision: Tensor, before: Tensor, options: RenderOptions
     ) -> Tensor:
         """Solves ``T(d) = 1/2`` for every ray.
 
         Args:
             ctx: autograd context.
-            alpha: opacity of every hit, 0 where a dense matrix has none.
-            peak: peak depth of every hit.
-            precision: inverse variance of every hit along its ray.
-            before: transmittance in front of every hit in blending order, without gradient.
-            rays: mapping between hits and rays.
+            alpha: ``[P, N]`` opacity of every Gaussian on every ray, 0 where it is not hit.
+            peak: ``[P, N]`` depth of the response's peak.
+            precision: ``[P, N]`` inverse variance along the ray.
+            before: ``[P, N]`` transmittance in front in blending order, without gradient.
             options: near plane, iterations, slope floor.
 
         Returns:
-            Depth of every ray; 0 where the final transmittance is 0.45 or more, or the median is nearer than ``near``.
+            Depth ``[P]``; 0 where the final transmittance is 0.45 or more, or the median is nearer than ``near``.
         """
 
         def residual(t: Tensor) -> Tensor:
-            return rays.sum(log_transmittance(rays.expand(t), alpha, peak, precision)) - LOG_HALF
+            return log_transmittance(t[:, None], alpha, peak, precision).sum(-1) - LOG_HALF
 
         reach = BRACKET_SIGMAS / precision.sqrt()
         hit = alpha > 0
         inf = torch.full_like(peak, torch.inf)
-        lo = rays.amin(torch.where(hit, peak - reach, inf)).clamp(min=options.near)
+        lo = torch.where(hit, peak - reach, inf).amin(-1).clamp(min=options.near)
         # if the hits up to here blend to at most 1/4, T is at most sqrt(1/4) = 1/2 behind their peaks
-        near_hits = rays.amax(torch.where(hit & (before > 0.25), peak, -inf))
-        all_hits = rays.amax(torch.where(hit, peak + reach, -inf))
-        final = rays.sum(torch.log1p(-alpha)).exp()
+        near_hits = torch.where(hit & (before > 0.25), peak, -inf).amax(-1)
+        all_hits = torch.where(hit, peak + reach, -inf).amax(-1)
+        final = torch.log1p(-alpha).sum(-1).exp()
         hi = torch.where(final <= 0.25, near_hits, all_hits)
         solvable = final < MEDIAN_MAX_TRANSMITTANCE
         lo = torch.where(solvable, lo, torch.ones_like(lo))
@@ -97,32 +76,31 @@ class MedianDepth(torch.autograd.Function):
         depth = 0.5 * (lo + hi)
         tiny = torch.finfo(depth.dtype).tiny
         for _ in range(options.newton_steps):
-            step = residual(depth) / rays.sum(slope(rays.expand(depth), alpha, peak, precision)).clamp(min=tiny)
+            step = residual(depth) / slope(depth[:, None], alpha, peak, precision).sum(-1).clamp(min=tiny)
             depth = torch.minimum(torch.maximum(depth + step, lo), hi)
         depth = torch.where(solvable, depth, torch.zeros_like(depth))
         ctx.save_for_backward(alpha, peak, precision, depth)
-        ctx.rays, ctx.slope_floor = rays, options.slope_floor
+        ctx.slope_floor = options.slope_floor
         return depth
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
         """``dd/dtheta = -(dT/dtheta) / (dT/dd)``; ``dd/dt*`` is non-negative and sums to 1 over a ray."""
         alpha, peak, precision, depth = ctx.saved_tensors
-        rays: Rays = ctx.rays
         valid = depth > 0
-        offset = rays.expand(depth) - peak
+        offset = depth[:, None] - peak
         bell = torch.exp(-0.5 * precision * offset**2)
         g = alpha * bell
         half = 0.5 / (1 - g)
-        total = rays.sum(half * g * precision * offset.abs())
+        total = (half * g * precision * offset.abs()).sum(-1)
         floor = ctx.slope_floor / torch.where(valid, depth, torch.ones_like(depth))
         total = torch.maximum(total, floor).clamp(min=torch.finfo(total.dtype).tiny)
-        factor = rays.expand(torch.where(valid, grad_outputs[0] / total, torch.zeros_like(depth)))
+        factor = torch.where(valid, grad_outputs[0] / total, torch.zeros_like(depth))[:, None]
         passed = offset > 0
         grad_alpha = torch.where(passed, half * bell - 1 / (1 - alpha), -half * bell)
         grad_peak = half * g * precision * offset.abs()
         grad_precision = torch.where(passed, -0.5, 0.5) * half * g * offset**2
-        return factor * grad_alpha, factor * grad_peak, factor * grad_precision, None, None, None
+        return factor * grad_alpha, factor * grad_peak, factor * grad_precision, None, None
 
 
 def ray_depth(
@@ -132,33 +110,31 @@ def ray_depth(
     final: Tensor,
     peak: Tensor,
     precision: Tensor,
-    rays: Rays,
     options: RenderOptions,
 ) -> Tensor:
-    """Returns the depth of every ray, as ``options.mode`` and ``options.depth`` select; 0 where a ray has none.
+    """Returns the depth ``[P]`` of every ray, as ``options.mode`` and ``options.depth`` select; 0 where a ray has none.
 
     Rasterised expected depth is the paper's eqn sup_gs_depth_render.
 
     Args:
-        alpha: opacity of every hit, 0 where a dense matrix has none.
-        weight: blending weight of every hit.
-        before: transmittance in front of every hit in blending order, without gradient.
-        final: transmittance of every ray.
-        peak: peak depth of every hit.
-        precision: inverse variance of every hit along its ray.
-        rays: mapping between hits and rays.
+        alpha: ``[P, N]`` opacity of every Gaussian on every ray, 0 where it is not hit.
+        weight: ``[P, N]`` blending weight.
+        before: ``[P, N]`` transmittance in front in blending order, without gradient.
+        final: ``[P]`` transmittance of every ray.
+        peak: ``[P, N]`` depth of the response's peak.
+        precision: ``[P, N]`` inverse variance along the ray.
         options: mode, kind of depth, and the solver's settings.
     """
     if options.mode == "solid":
-        depth = MedianDepth.apply(alpha, peak, precision, before, rays, options)
+        depth = MedianDepth.apply(alpha, peak, precision, before, options)
         assert isinstance(depth, Tensor)
         return depth
     if options.depth == "expected":
         covered = 1 - final
         hit = covered.detach() > 0
-        return torch.where(hit, rays.sum(weight * peak) / torch.where(hit, covered, 1.0), 0.0)
+        return torch.where(hit, (weight * peak).sum(-1) / torch.where(hit, covered, 1.0), 0.0)
     crossing = (before > 0.5) & (before * (1 - alpha.detach()) <= 0.5)
-    return rays.sum(crossing * peak)
+    return (crossing * peak).sum(-1)
 
 
 def depth_factors(

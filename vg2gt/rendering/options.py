@@ -1,12 +1,9 @@
-"""Inputs and output of a rasteriser: options, one scene with its views, and images."""
+"""Options of the renderer."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from typing import Any, Literal, get_args
-
-import torch
-from torch import Tensor
 
 Mode = Literal["solid", "rasterized"]
 DepthKind = Literal["median", "expected"]
@@ -75,74 +72,3 @@ def check_choice(name: str, value: object, literal: Any) -> None:
     choices = get_args(literal)
     if value not in choices:
         raise ValueError(f"{name} must be one of {', '.join(choices)}, got {value!r}")
-
-
-@dataclass(frozen=True)
-class SceneViews:
-    """One scene and V views of it, the argument of every rasteriser.
-
-    Attributes:
-        means: ``[G, 3]`` world positions.
-        quats: ``[G, 4]`` wxyz, any norm.
-        scales: ``[G, 3]`` standard deviations.
-        opacities: ``[G]``.
-        colors: ``[V, G, 3]``, or ``[1, G, 3]`` where the colour does not depend on the view.
-        world_to_camera: ``[V, 4, 4]``.
-        intrinsics: ``[V, 3, 3]`` pixels, integer pixel centres, no skew.
-        background: ``[3]``.
-        size: image ``(height, width)``.
-    """
-
-    means: Tensor
-    quats: Tensor
-    scales: Tensor
-    opacities: Tensor
-    colors: Tensor
-    world_to_camera: Tensor
-    intrinsics: Tensor
-    background: Tensor
-    size: tuple[int, int]
-
-    @property
-    def tensors(self) -> tuple[Tensor, ...]:
-        """The differentiable inputs in declaration order."""
-        return tuple(getattr(self, field.name) for field in fields(self) if field.name != "size")
-
-    def view(self, index: int) -> SceneViews:
-        """Returns the scene with one view (V = 1)."""
-        one = slice(index, index + 1)
-        colors = self.colors if self.colors.shape[0] == 1 else self.colors[one]
-        return replace(self, colors=colors, world_to_camera=self.world_to_camera[one], intrinsics=self.intrinsics[one])
-
-    def gather(self, index: Tensor) -> SceneViews:
-        """Returns the Gaussians of the given indices, in that order."""
-        return replace(
-            self,
-            means=self.means[index],
-            quats=self.quats[index],
-            scales=self.scales[index],
-            opacities=self.opacities[index],
-            colors=self.colors[:, index],
-        )
-
-
-@dataclass(frozen=True)
-class Images:
-    """Output of a rasteriser: V views, channels last.
-
-    Attributes:
-        color: ``[V, H, W, 3]``, background blended in.
-        normal: ``[V, H, W, 3]``.
-        depth: ``[V, H, W]``, 0 where the ray has none.
-        alpha: ``[V, H, W]``.
-    """
-
-    color: Tensor
-    normal: Tensor
-    depth: Tensor
-    alpha: Tensor
-
-    @staticmethod
-    def stack(views: list[Images]) -> Images:
-        """Concatenates renders of single views along V."""
-        return Images(*(torch.cat([getattr(view, field.name) for view in views]) for field in fields(Images)))

@@ -23,7 +23,8 @@ from torch.nn import functional as F
 
 from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.kernels.constants import ALPHA_MIN, JACOBIAN_CLAMP
-from vg2gt.rendering.options import RenderOptions, SceneViews
+from vg2gt.rendering.options import RenderOptions
+from vg2gt.rendering.scenes import SceneViews
 
 
 @dataclass(frozen=True)
@@ -122,8 +123,8 @@ def screen_box(splats: Splats) -> tuple[Tensor, Tensor]:
     return torch.cat((middle - half, middle + half), -1), bounded
 
 
-def visible_splats(scene: SceneViews, options: RenderOptions) -> tuple[Splats, Tensor]:
-    """Returns splats in the image, front to back by the depth of their means, and their boxes ``[N, 4]`` (no gradient).
+def visible_splats(scene: SceneViews, options: RenderOptions) -> Splats:
+    """Returns the splats in the image, front to back by the depth of their means.
 
     Selecting first keeps the undefined derivatives of hidden Gaussians out of the graph.
     """
@@ -136,32 +137,7 @@ def visible_splats(scene: SceneViews, options: RenderOptions) -> tuple[Splats, T
         inside = (box[:, 2] >= 0) & (box[:, 3] >= 0) & (box[:, 0] <= width - 1) & (box[:, 1] <= height - 1)
         index = torch.nonzero(in_front & bounded & inside)[:, 0]
         index = index[torch.argsort(splats.depth[index], stable=True)]
-        box = box[index]
-    return project(scene.gather(index), options), box
-
-
-def pixel_boxes(box: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Returns first and last pixel ``[N, 2]`` as (x, y) of boxes, clipped to the image; last < first if it has none."""
-    height, width = size
-    limit = torch.tensor([width - 1, height - 1], device=box.device)
-    return box[:, :2].ceil().clamp(min=0).long(), torch.minimum(box[:, 2:].floor().clamp(min=-1).long(), limit)
-
-
-def list_cells(first: Tensor, extent: Tensor) -> tuple[Tensor, Tensor]:
-    """Lists the cells of rectangles, row by row, in the rectangles' order.
-
-    Args:
-        first: ``[N, 2]`` lowest cell as (x, y).
-        extent: ``[N, 2]`` number of cells in x and in y, at least 0.
-
-    Returns:
-        Rectangle index ``[M]`` and cell ``[M, 2]``.
-    """
-    area = extent.prod(-1)
-    index = torch.repeat_interleave(area)
-    number = torch.arange(len(index), device=first.device) - (torch.cumsum(area, 0) - area)[index]
-    columns = extent[index, 0]
-    return index, first[index] + torch.stack((number % columns, number // columns), -1)
+    return project(scene.gather(index), options)
 
 
 def respond(splats: Splats, pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -16,19 +16,11 @@ from vg2gt.rendering.checks import background_colors, check_finite, check_shapes
 from vg2gt.rendering.cpu_tiles import rasterize_cpu
 from vg2gt.rendering.dense import rasterize_dense
 from vg2gt.rendering.options import Mode, RenderOptions, check_choice
-from vg2gt.rendering.pairs import rasterize_pairs
-from vg2gt.rendering.scenes import Rasterizer, render_scenes
+from vg2gt.rendering.scenes import render_scenes
 from vg2gt.rendering.selfcheck import require_trusted
 from vg2gt.types import Cameras, Gaussians, Render
 
-Implementation = Literal["auto", "torch", "dense", "cpu", "triton"]
-
-RASTERIZERS: dict[str, Rasterizer] = {
-    "torch": rasterize_pairs,
-    "dense": rasterize_dense,
-    "cpu": rasterize_cpu,
-}
-"""Rasterisers that render one scene per call. The Triton one renders all scenes at once and is not listed."""
+Implementation = Literal["auto", "dense", "cpu", "triton"]
 
 
 @dataclass(frozen=True)
@@ -36,9 +28,9 @@ class Renderer(RenderOptions):
     """A renderer with its options fixed; calling it renders.
 
     Attributes:
-        implementation: ``cpu``: compiled tile renderer. ``triton``: the same for CUDA devices. ``torch``: sparse pairs
-            on any device. ``dense``: the slow reference. ``auto``: ``cpu`` on CPUs; ``triton`` on CUDA devices, after a
-            check against the reference (:mod:`vg2gt.rendering.selfcheck`); ``torch`` elsewhere.
+        implementation: ``cpu``: compiled tile renderer; renders scenes of other devices on the CPU. ``triton``: the
+            same for CUDA devices. ``dense``: the slow reference, on any device. ``auto``: ``triton`` on CUDA devices,
+            after a check against the reference (:mod:`vg2gt.rendering.selfcheck`); ``cpu`` elsewhere.
     """
 
     implementation: Implementation = "auto"
@@ -77,7 +69,10 @@ class Renderer(RenderOptions):
             check_values(gaussians, cameras)
             check_finite("background", color)
             gaussians, cameras = gaussians.map(_floats_to(dtype)), cameras.map(_floats_to(dtype))
-            return render_scenes(RASTERIZERS[implementation], gaussians, cameras, color, options)
+            if implementation == "dense":
+                return render_scenes(rasterize_dense, gaussians, cameras, color, options)
+            host = (gaussians.to("cpu"), cameras.to("cpu"), color.cpu())
+            return render_scenes(rasterize_cpu, *host, options).to(device)
 
 
 def render(
@@ -115,9 +110,7 @@ def render(
 def _render_triton(gaussians: Gaussians, cameras: Cameras, background: Tensor, options: RenderOptions) -> Render:
     """Renders with Triton, imported only here because CPU builds of torch lack it; ``background``: ``[1 or B, 3]``."""
     if importlib.util.find_spec("triton") is None:
-        raise ValueError(
-            "implementation 'triton' needs the package triton; install a CUDA build of torch or use 'torch'"
-        )
+        raise ValueError("implementation 'triton' needs the package triton; install a CUDA build of torch or use 'cpu'")
     from vg2gt.rendering.gpu_tiles import RefusedError, render_triton
 
     black = background.new_zeros(3)
@@ -137,8 +130,6 @@ def _render_triton(gaussians: Gaussians, cameras: Cameras, background: Tensor, o
 def _resolve(implementation: Implementation, device: torch.device) -> str:
     if implementation == "auto":
         return automatic(device)
-    if implementation == "cpu" and device.type != "cpu":
-        raise ValueError(f"implementation 'cpu' requires CPU tensors, got {device}; use 'auto' or 'torch'")
     if implementation == "triton" and device.type != "cuda" and os.environ.get("TRITON_INTERPRET") != "1":
         raise ValueError(f"implementation 'triton' requires CUDA tensors, got {device}; use 'auto'")
     return implementation
@@ -153,7 +144,7 @@ def automatic(device: torch.device) -> str:
     if device.type == "cuda":
         require_trusted(device)
         return "triton"
-    return "cpu" if device.type == "cpu" else "torch"
+    return "cpu"
 
 
 def _floats_to(dtype: torch.dtype) -> Callable[[Tensor], Tensor]:

@@ -1,9 +1,9 @@
-"""Renders several scenes with a rasteriser for a single scene."""
+"""One scene with its views, the input of a rasteriser, and rendering of several scenes with one."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
@@ -11,8 +11,61 @@ from torch.nn import functional as F
 
 from vg2gt.geometry.cameras import invert_rigid
 from vg2gt.geometry.spherical_harmonics import sh_to_rgb
-from vg2gt.rendering.options import Images, RenderOptions, SceneViews
+from vg2gt.rendering.options import RenderOptions
 from vg2gt.types import Cameras, Gaussians, Render
+
+Images = tuple[Tensor, Tensor, Tensor, Tensor]
+"""Colour (background blended in) and normals ``[V, H, W, 3]``, depth (0: none) and alpha ``[V, H, W]``."""
+
+
+@dataclass(frozen=True)
+class SceneViews:
+    """One scene and V views of it, the argument of every rasteriser.
+
+    Attributes:
+        means: ``[G, 3]`` world positions.
+        quats: ``[G, 4]`` wxyz, any norm.
+        scales: ``[G, 3]`` standard deviations.
+        opacities: ``[G]``.
+        colors: ``[V, G, 3]``, or ``[1, G, 3]`` where the colour does not depend on the view.
+        world_to_camera: ``[V, 4, 4]``.
+        intrinsics: ``[V, 3, 3]`` pixels, integer pixel centres, no skew.
+        background: ``[3]``.
+        size: image ``(height, width)``.
+    """
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    colors: Tensor
+    world_to_camera: Tensor
+    intrinsics: Tensor
+    background: Tensor
+    size: tuple[int, int]
+
+    @property
+    def tensors(self) -> tuple[Tensor, ...]:
+        """The differentiable inputs in declaration order."""
+        return tuple(getattr(self, field.name) for field in fields(self) if field.name != "size")
+
+    def view(self, index: int) -> SceneViews:
+        """Returns the scene with one view (V = 1)."""
+        one = slice(index, index + 1)
+        colors = self.colors if self.colors.shape[0] == 1 else self.colors[one]
+        return replace(self, colors=colors, world_to_camera=self.world_to_camera[one], intrinsics=self.intrinsics[one])
+
+    def gather(self, index: Tensor) -> SceneViews:
+        """Returns the Gaussians of the given indices, in that order."""
+        return replace(
+            self,
+            means=self.means[index],
+            quats=self.quats[index],
+            scales=self.scales[index],
+            opacities=self.opacities[index],
+            colors=self.colors[:, index],
+        )
+
 
 Rasterizer = Callable[[SceneViews, RenderOptions], Images]
 
@@ -23,13 +76,8 @@ def render_scenes(
     """Renders B scenes into V views each; ``background`` is ``[B, 3]``."""
     scenes = range(len(background))
     images = [rasterize(_scene_views(gaussians.scene(b), cameras, b, background[b]), options) for b in scenes]
-    stacked = {field.name: torch.stack([getattr(image, field.name) for image in images]) for field in fields(Images)}
-    return Render(
-        color=stacked["color"].permute(0, 1, 4, 2, 3),  # [B, V, 3, H, W]
-        depth=stacked["depth"],
-        normal=stacked["normal"].permute(0, 1, 4, 2, 3),  # [B, V, 3, H, W]
-        alpha=stacked["alpha"],
-    )
+    color, normal, depth, alpha = (torch.stack(parts) for parts in zip(*images, strict=True))
+    return Render(color.permute(0, 1, 4, 2, 3), depth, normal.permute(0, 1, 4, 2, 3), alpha)
 
 
 def _scene_views(gaussians: Gaussians, cameras: Cameras, scene: int, background: Tensor) -> SceneViews:
