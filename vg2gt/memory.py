@@ -91,26 +91,39 @@ class Cap:
 
     Args:
         option: configuration key of the limit, for the log.
+        limit: largest number of elements per scene; None keeps all.
         what: name of the elements, for the log and the metric.
         rank: name of the lowest rank, such as ``least confident``, for the log.
 
+    Raises:
+        ValueError: if the limit is below 1.
+
     Attributes:
+        limit: as given.
         dropped: number of elements dropped in the last pass, over all scenes.
     """
 
-    def __init__(self, option: str, what: str, rank: str) -> None:
+    def __init__(self, option: str, limit: int | None, what: str, rank: str) -> None:
+        if limit is not None and limit < 1:
+            raise ValueError(f"{option} must be at least 1, or null for no limit, got {limit}")
         self.option = option
+        self.limit = limit
         self.what = what
         self.rank = rank
         self.dropped = 0
         self._passes = 0
 
-    def __call__(self, limit: int | None, ranks: Tensor, batch: Tensor) -> Tensor | None:
-        """Returns a ``[M]`` mask of the ``limit`` highest ranks per scene (None: keep all); ``batch [M]`` is sorted."""
+    def __call__(self, ranks: Tensor, batch: Tensor) -> Tensor | None:
+        """Returns a ``[M]`` mask of the highest ranks per scene (None: keep all); ``batch [M]`` is sorted."""
         self.dropped = 0
-        if limit is None or len(batch) <= limit:
+        if self.limit is None or len(batch) <= self.limit:
             return None
-        keep = _highest(ranks.detach(), batch, limit)
+        keep = torch.ones_like(batch, dtype=torch.bool)
+        begin = 0
+        for count in torch.bincount(batch).tolist():
+            lowest = ranks.detach()[begin : begin + count].argsort(stable=True)[: max(count - self.limit, 0)]
+            keep[begin + lowest] = False
+            begin += count
         self.dropped = int((~keep).sum())
         if not self.dropped:
             return None
@@ -118,35 +131,12 @@ class Cap:
         if self._passes & (self._passes - 1) == 0:
             log.warning(
                 "%s=%d per scene: dropped the %d %s of %d %s (passes that dropped some: %d; next warning at %d)",
-                self.option, limit, self.dropped, self.rank, len(batch), self.what, self._passes, 2 * self._passes,
+                self.option, self.limit, self.dropped, self.rank, len(batch), self.what, self._passes, 2 * self._passes,
             )  # fmt: skip
         return keep
 
 
-def check_limit(option: str, limit: int | None) -> int | None:
-    """Returns the limit; raises ValueError if it is below 1."""
-    if limit is not None and limit < 1:
-        raise ValueError(f"{option} must be at least 1, or null for no limit, got {limit}")
-    return limit
-
-
 def dropped_by(model: nn.Module) -> dict[str, int]:
     """Returns how many elements a model dropped in its last pass, by name; only for parts with a limit."""
-    found: dict[str, int] = {}
-    for module in model.modules():
-        cap = getattr(module, "cap", None)
-        if isinstance(cap, Cap) and getattr(module, f"max_{cap.what.lower()}") is not None:
-            found[cap.what.lower()] = cap.dropped
-    return found
-
-
-def _highest(ranks: Tensor, batch: Tensor, limit: int) -> Tensor:
-    """Returns ``[M]`` bool, true for the ``limit`` highest ranks of every scene."""
-    keep = torch.ones_like(batch, dtype=torch.bool)
-    begin = 0
-    for count in torch.bincount(batch).tolist():
-        if count > limit:
-            lowest = ranks[begin : begin + count].argsort(stable=True)[: count - limit]
-            keep[begin + lowest] = False
-        begin += count
-    return keep
+    caps = [cap for module in model.modules() if isinstance(cap := getattr(module, "cap", None), Cap)]
+    return {cap.what.lower(): cap.dropped for cap in caps if cap.limit is not None}

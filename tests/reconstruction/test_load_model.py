@@ -25,7 +25,7 @@ def test_options_change_parts(run_folder: Path) -> None:
     overrides = ["backend.depth_noise=0.5", "backend.taps=4", "model.fine.max_voxels=50", "renderer.near=0.5"]
     for backend in ("oracle", None):  # named again, or the run's own
         loaded = load_model(run_folder, backend, overrides, device="cpu")
-        assert (loaded.model.backend.depth_noise, loaded.model.get_submodule("fine").max_voxels) == (0.5, 50)
+        assert (loaded.model.backend.depth_noise, loaded.model.get_submodule("fine").cap.limit) == (0.5, 50)
         assert loaded.renderer.near == 0.5
 
 

@@ -14,7 +14,7 @@ from vg2gt.geometry.cameras import camera_centers, focal_lengths, unproject
 from vg2gt.geometry.precision import full_precision
 from vg2gt.geometry.symmetric import UPPER
 from vg2gt.kernels.point_moments import Moments
-from vg2gt.memory import Cap, check_limit, note_sizes
+from vg2gt.memory import Cap, note_sizes
 from vg2gt.method.additions.point_moments import pool_point_moments
 from vg2gt.method.additions.silhouette import on_surface
 from vg2gt.method.additions.voxel_normals import surface_normals
@@ -97,8 +97,7 @@ class FineModule(nn.Module):
         self.voxel_size = voxel_size
         self.min_footprint = min_footprint
         self.coarsest_drawn = coarsest_drawn
-        self.max_voxels = check_limit("model.fine.max_voxels", max_voxels)
-        self.cap = Cap("model.fine.max_voxels", "voxels", "least confident")
+        self.cap = Cap("model.fine.max_voxels", max_voxels, "voxels", "least confident")
         self.dense_head = dense_head(token_dims=token_dims, patch_size=patch_size)
         width = self.dense_head.out_channels
         self.point_offset = nn.Linear(3, width, bias=False)
@@ -128,7 +127,7 @@ class FineModule(nn.Module):
             coarsen = drawn if coarsen is None else coarsen * drawn
         with full_precision(images):
             size = scene_voxel_size(geometry, self.voxel_size, self.min_footprint, coarsen)
-        return self._refine(self._measure(tokens, geometry, images, size, self.max_voxels), size)
+        return self._refine(self._measure(tokens, geometry, images, size, capped=True), size)
 
     @torch.no_grad()
     def pool(self, tokens: Tokens, geometry: Geometry, images: Tensor, size: Tensor) -> PooledVoxels:
@@ -140,7 +139,9 @@ class FineModule(nn.Module):
             images: as for :meth:`forward`.
             size: ``[1]`` voxel edge length of the whole scene.
         """
-        plan, features, means, confidence, moments, weights = self._measure(tokens, geometry, images, size, None)
+        plan, features, means, confidence, moments, weights = self._measure(
+            tokens, geometry, images, size, capped=False
+        )
         ordered = weights[plan.order].double()
         weight = torch.segment_reduce(ordered, "sum", lengths=plan.counts, unsafe=True) if len(plan) else ordered
         columns = None if moments is None else torch.cat([each.reshape(len(plan), -1) for each in moments], 1)
@@ -154,9 +155,8 @@ class FineModule(nn.Module):
             pooled: merged results of :meth:`pool`.
             size: ``[1]`` voxel edge length of the whole scene.
         """
-        if self.max_voxels is not None:
-            keep = self.cap(self.max_voxels, pooled.confidence, torch.zeros_like(pooled.count))
-            pooled = pooled if keep is None else pooled.rows(keep)
+        keep = self.cap(pooled.confidence, torch.zeros_like(pooled.count))
+        pooled = pooled if keep is None else pooled.rows(keep)
         note_sizes({"voxels": len(pooled)})
         moments = None
         if pooled.moments is not None:
@@ -165,13 +165,15 @@ class FineModule(nn.Module):
         parts = (pooled.features, pooled.means, pooled.confidence, moments, pooled.weight)
         return self._refine(_Measured(pooled.plan(), *parts), size)
 
-    def _measure(
-        self, tokens: Tokens, geometry: Geometry, images: Tensor, size: Tensor, max_voxels: int | None
-    ) -> _Measured:
+    def _measure(self, tokens: Tokens, geometry: Geometry, images: Tensor, size: Tensor, capped: bool) -> _Measured:
         # pixels to points and their cells
         with full_precision(images):
             points = _Points(geometry, size, self.drop_fringes)
-            plan = self._plan(points, max_voxels)
+            plan = plan_voxels(points.cells, points.batch, points.valid)
+            note_sizes({"voxels": len(plan)})
+            if capped and self.cap.limit is not None:
+                keep = self.cap(pool_min(points.confidence.detach(), plan), plan.batch)
+                plan = plan if keep is None else plan.select(keep)
             if images.shape[1] > 1:
                 warn_if_sparse(plan, len(size), "fine")
         # dense features to voxels: [M, C]
@@ -232,14 +234,6 @@ class FineModule(nn.Module):
         if with_gradient:
             return pool_point_features(next(chunks), *others)
         return pool_point_features_of_chunks(chunks, *others)
-
-    def _plan(self, points: _Points, max_voxels: int | None) -> VoxelPlan:
-        plan = plan_voxels(points.cells, points.batch, points.valid)
-        note_sizes({"voxels": len(plan)})
-        if max_voxels is None:
-            return plan
-        keep = self.cap(max_voxels, pool_min(points.confidence.detach(), plan), plan.batch)
-        return plan if keep is None else plan.select(keep)
 
 
 class _Measured(NamedTuple):

@@ -12,7 +12,7 @@ from torch.nn import functional as F
 
 from vg2gt.geometry.rotations import matrix_to_quat, multiply_quats
 from vg2gt.geometry.spherical_harmonics import MAX_DEGREE, rgb_to_sh
-from vg2gt.memory import Cap, check_limit, note_sizes
+from vg2gt.memory import Cap, note_sizes
 from vg2gt.method.additions.surfel import SurfelStart, surfel_start
 from vg2gt.types import Gaussians, Voxels
 
@@ -70,8 +70,7 @@ class GaussianHead(nn.Module):
         self.sh_degree = sh_degree
         self.anchor = anchor
         self.max_offset = max_offset
-        self.max_gaussians = check_limit("model.gaussians.max_gaussians", max_gaussians)
-        self.cap = Cap("model.gaussians.max_gaussians", "Gaussians", "least opaque")
+        self.cap = Cap("model.gaussians.max_gaussians", max_gaussians, "Gaussians", "least opaque")
         bands = (sh_degree + 1) ** 2
         self.parts = (3, 3, 4, 1, 3 * bands)
         self.hidden = nn.Linear(in_channels, hidden or in_channels)
@@ -124,7 +123,7 @@ class GaussianHead(nn.Module):
         batch = voxels.batch.repeat_interleave(self.splits)
         note_sizes({"Gaussians": len(batch)})
         parts = Gaussians(*(part.flatten(0, 1) for part in (means, quats, scales, opacities, sh)), batch=batch)
-        keep = self.cap(self.max_gaussians, parts.opacities, batch)
+        keep = self.cap(parts.opacities, batch)
         return parts if keep is None else parts.map(lambda tensor: tensor[keep])
 
     def _surfels(self, voxels: Voxels) -> SurfelStart:
