@@ -110,16 +110,13 @@ class Operations(TorchDispatchMode):
 @contextmanager
 def as_on_a_gpu() -> Iterator[None]:
     """Makes a CPU run the code paths of a GPU inside the block, except Triton kernels."""
-    from vg2gt.kernels import curve_codes, row_products
     from vg2gt.losses import gaussian, geometry
-    from vg2gt.method import knn, point_features, point_mlp, sparse_conv
-    from vg2gt.method.additions import point_moments, voxel_normals
+    from vg2gt.method import fine, knn, sparse_conv
+    from vg2gt.method.additions import voxel_normals
 
     changes: list[tuple[Any, str, Any]] = [
-        (module, "compilable", lambda *_, **__: False)
-        for module in (knn, point_features, point_moments, voxel_normals, curve_codes)
+        (module, "compilable", lambda *_, **__: False) for module in (knn, fine, voxel_normals)
     ]
-    changes += [(module, "has_onednn", lambda device: False) for module in (row_products, point_mlp)]
     changes += [
         (sparse_conv, "one_by_one", lambda device: False),
         (geometry, "point_normal_loss", geometry.point_normal_reference),

@@ -72,7 +72,7 @@ def memory_advice(advice: str) -> Iterator[None]:
 
 def note_sizes(sizes: Mapping[str, int], first: bool = False) -> None:
     """Records element counts of a pass for the error message; ``first`` clears those of the previous pass."""
-    noted = None if torch.compiler.is_compiling() else _sizes.get()
+    noted = _sizes.get()
     if noted is None:
         return
     if first:

@@ -35,20 +35,20 @@ def assert_background(gaussians: Gaussians, implementation: Implementation, mode
     assert not out.normal.any()
 
 
+UNSEEN = {
+    "none": soup(0),
+    "behind the camera": replace(soup(20), means=-soup(20).means),
+    "beside the image": replace(soup(20, size=0.01), means=soup(20).means + torch.tensor([500.0, 0.0, 0.0])),
+    "transparent": replace(soup(20), opacities=torch.zeros(20).double()),
+}
+
+
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 class TestDegenerateScenes:
-    def test_no_gaussians(self, implementation: Implementation, mode: Mode) -> None:
-        assert_background(soup(0), implementation, mode)
-
-    def test_all_behind_the_camera(self, implementation: Implementation, mode: Mode) -> None:
-        gaussians = soup(20)
-        assert_background(replace(gaussians, means=-gaussians.means), implementation, mode)
-
-    def test_none_in_the_image(self, implementation: Implementation, mode: Mode) -> None:
-        gaussians = soup(20, size=0.01)
-        shifted = gaussians.means + torch.tensor([500.0, 0.0, 0.0])
-        assert_background(replace(gaussians, means=shifted), implementation, mode)
+    @pytest.mark.parametrize("gaussians", UNSEEN.values(), ids=UNSEEN)
+    def test_nothing_to_see(self, implementation: Implementation, mode: Mode, gaussians: Gaussians) -> None:
+        assert_background(gaussians, implementation, mode)
 
     def test_straddling_the_camera(self, implementation: Implementation, mode: Mode) -> None:
         gaussians = soup(30)
@@ -62,21 +62,12 @@ class TestDegenerateScenes:
         assert_sound(gaussians, pinhole((6, 9)).map(torch.Tensor.float), implementation, mode)
 
     @pytest.mark.parametrize("size", [(1, 1), (3, 50), (17, 33)])
-    def test_any_image_size(self, implementation: Implementation, mode: Mode, size: tuple[int, int]) -> None:
-        gaussians = soup(40, size=0.3)
-        alpha = assert_sound(gaussians, pinhole(size), implementation, mode)
-        reference = render(gaussians, pinhole(size), mode, implementation="dense").alpha
+    @pytest.mark.parametrize("focal", [(30.0, 28.0), (8.0, 40.0)])
+    def test_any_image_size_and_focal_lengths(self, implementation: Implementation, mode: Mode, size, focal) -> None:
+        gaussians, cameras = soup(40, size=0.3), pinhole(size, focal)
+        alpha = assert_sound(gaussians, cameras, implementation, mode)
+        reference = render(gaussians, cameras, mode, implementation="dense").alpha
         torch.testing.assert_close(alpha, reference, rtol=0, atol=1e-12)
-
-    def test_anisotropic_focal_lengths(self, implementation: Implementation, mode: Mode) -> None:
-        cameras = pinhole((12, 15), focal=(8.0, 40.0))
-        alpha = assert_sound(soup(40), cameras, implementation, mode)
-        reference = render(soup(40), cameras, mode, implementation="dense").alpha
-        torch.testing.assert_close(alpha, reference, rtol=0, atol=1e-12)
-
-    def test_transparent(self, implementation: Implementation, mode: Mode) -> None:
-        gaussians = soup(20)
-        assert_background(replace(gaussians, opacities=torch.zeros(20).double()), implementation, mode)
 
 
 @pytest.mark.parametrize(

@@ -2,10 +2,8 @@ import pytest
 import torch
 from scipy.spatial import KDTree
 
-from vg2gt.kernels import cell_search
-from vg2gt.kernels.cell_search import nearest_by_cells
 from vg2gt.method import knn
-from vg2gt.method.knn import interpolate, interpolation_weights, nearest_neighbors
+from vg2gt.method.knn import interpolate, interpolation_weights, nearest_by_cells, nearest_neighbors
 
 
 @pytest.fixture(params=["trees", "cells"], autouse=True)
@@ -51,8 +49,8 @@ def test_cells_find_what_a_tree_finds(cloud, neighbors, monkeypatch):
     expected, _ = KDTree(found_in.double().numpy()).query(queries.double().numpy(), k=neighbors)
     zeros = torch.zeros(len(queries) + len(found_in), dtype=torch.int64)
     for at_once, candidates in ((1 << 18, 1 << 23), (97, 1000)):
-        monkeypatch.setattr(cell_search, "QUERIES", at_once)
-        monkeypatch.setattr(cell_search, "CANDIDATES", candidates)
+        monkeypatch.setattr(knn, "QUERIES", at_once)
+        monkeypatch.setattr(knn, "CANDIDATES", candidates)
         index, found = nearest_by_cells(queries, zeros[: len(queries)], found_in, zeros[: len(found_in)], neighbors, 1)
         assert found.all()
         assert all(len(row.unique()) == neighbors for row in index)
@@ -97,8 +95,8 @@ def test_gradients_flow_to_features_and_positions():
 @pytest.mark.parametrize("search", ["cells"], indirect=True)
 def test_the_cost_of_the_search_by_cells_is_linear(search, monkeypatch):
     """Counted: distances computed per query, for a scene and for one sixteen times as large and as dense."""
-    examined, nearest = [], cell_search._nearest
-    monkeypatch.setattr(cell_search, "_nearest", lambda *args: (examined.append(args[4]), nearest(*args)))
+    examined, nearest = [], knn._nearest
+    monkeypatch.setattr(knn, "_nearest", lambda *args: (examined.append(args[4]), nearest(*args)))
     per_query = []
     for copies in (1, 16):
         places = torch.arange(copies)[:, None, None] * torch.tensor([500.0, 0, 0])

@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from vg2gt.method.fine import point_features, pool_point_features
 from vg2gt.method.grid import VoxelPlan, plan_voxels, pool_mean
-from vg2gt.method.point_features import point_features, pool_point_features
 
 CHANNELS = 20  # no multiple of a vector's length
 

@@ -1,4 +1,4 @@
-"""The compiled pass over points' second moments holds to the plain one and to the definition."""
+"""Second moments of points hold to their definition."""
 
 from __future__ import annotations
 
@@ -6,19 +6,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from vg2gt.kernels.point_moments import Moments
-from vg2gt.method.additions import point_moments
-from vg2gt.method.additions.point_moments import pool_point_moments
+from vg2gt.method.additions.point_moments import Moments, pool_point_moments
 from vg2gt.method.grid import VoxelPlan, plan_voxels, pool_mean
 
 VIEWS = 7
-CHUNK = 3  # of the views, where the pass is plain
-
-
-@pytest.fixture(params=[True, False])
-def compiled(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By the compiled pass and by the plain one."""
-    monkeypatch.setattr(point_moments, "compilable", lambda *_: request.param)
+CHUNK = 3  # of the views
 
 
 def points(per_view: int = 431) -> tuple[list[Tensor], VoxelPlan]:
@@ -56,7 +48,6 @@ def by_definition(inputs: list[Tensor], plan: VoxelPlan) -> Moments:
     return spread, cross, eye, pixel
 
 
-@pytest.mark.usefixtures("compiled")
 def test_moments_are_those_of_the_definition() -> None:
     inputs, plan = points()
     assert 0 < int((plan.voxel_of < 0).sum()) < 600
@@ -81,7 +72,6 @@ def test_every_point_has_its_own_view(per_view: int) -> None:
     assert not cross.abs().max() > 1e-6
 
 
-@pytest.mark.usefixtures("compiled")
 def test_points_in_no_voxel_have_no_say() -> None:
     inputs, plan = points()
     before, left_out = pooled(inputs, plan), plan.voxel_of < 0
@@ -92,7 +82,6 @@ def test_points_in_no_voxel_have_no_say() -> None:
 
 
 # place, colour, depth, confidence
-@pytest.mark.usefixtures("compiled")
 @pytest.mark.parametrize(("part", "column", "numbers"), [(0, 1, 5 + 3), (0, 5, 3), (1, 0, 1), (2, 0, 9 + 9 + 3 + 1)])
 def test_nan_reaches_its_voxel_and_no_other(part, column, numbers):
     """Training finds faults by what is not finite."""

@@ -1,16 +1,11 @@
-"""Codes of cells on space-filling curves: Morton in torch; Hilbert in torch, numba (CPUs) and Triton (CUDA devices)."""
+"""Codes of cells on space-filling curves: Morton in torch; Hilbert in torch and Triton (CUDA devices)."""
 
 from __future__ import annotations
 
 import importlib.util
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
-
-from vg2gt.kernels.compiled import kernel
-from vg2gt.kernels.threads import compilable
 
 
 def _spread_bits(values: Tensor) -> Tensor:
@@ -33,7 +28,7 @@ def z_codes(grid: Tensor) -> Tensor:
 
 
 def hilbert_codes(grid: Tensor, bits: int) -> Tensor:
-    """Hilbert codes of cells (J. Skilling, "Programming the Hilbert curve", 2004), by a compiled kernel if possible.
+    """Hilbert codes of cells (J. Skilling, "Programming the Hilbert curve", 2004), in one kernel on CUDA devices.
 
     Args:
         grid: ``[M, 3]`` int64 with 0 <= coordinate < 2^bits.
@@ -46,42 +41,12 @@ def hilbert_codes(grid: Tensor, bits: int) -> Tensor:
         from vg2gt.kernels.hilbert import hilbert_in_one_kernel
 
         return hilbert_in_one_kernel(grid, bits)
-    if not compilable(grid, dtype=torch.int64):
-        return hilbert_reference(grid, bits)
-    codes = grid.new_empty(len(grid))
-    _hilbert(grid.numpy(), bits, np.empty(3, np.int64), codes.numpy())
-    return codes
+    return hilbert_reference(grid, bits)
 
 
 def has_kernel(device: torch.device) -> bool:
     """Whether a Triton kernel computes Hilbert codes on this device."""
-    cuda = device.type == "cuda" and not torch.compiler.is_compiling()
-    return cuda and importlib.util.find_spec("triton") is not None
-
-
-@kernel(nogil=True)
-def _hilbert(grid: NDArray[np.int64], bits: int, axes: NDArray[np.int64], codes: NDArray[np.int64]) -> None:
-    """:func:`hilbert_reference`, one cell at a time; ``axes`` ``[3]`` is scratch memory."""
-    for m in range(len(grid)):
-        axes[0], axes[1], axes[2] = grid[m, 0], grid[m, 1], grid[m, 2]
-        for level in range(bits - 1, 0, -1):
-            below = (1 << level) - 1
-            for i in range(3):
-                if axes[i] >> level & 1:
-                    axes[0] ^= below
-                else:
-                    swapped = (axes[0] ^ axes[i]) & below
-                    axes[0] ^= swapped
-                    axes[i] ^= swapped
-        axes[1] ^= axes[0]
-        axes[2] ^= axes[1]
-        flip, code = 0, 0
-        for level in range(bits - 1, 0, -1):
-            flip ^= ((1 << level) - 1) * (axes[2] >> level & 1)
-        for level in range(bits - 1, -1, -1):
-            for i in range(3):
-                code = code << 1 | ((axes[i] ^ flip) >> level & 1)
-        codes[m] = code
+    return device.type == "cuda" and importlib.util.find_spec("triton") is not None
 
 
 def hilbert_reference(grid: Tensor, bits: int) -> Tensor:

@@ -1,4 +1,4 @@
-"""The compiled pass of :func:`vg2gt.method.point_features.pool_point_features`."""
+"""The compiled pass of :func:`vg2gt.method.fine.pool_point_features`."""
 
 from __future__ import annotations
 

@@ -81,10 +81,9 @@ def _pool(threads: int, process: int) -> ThreadPoolExecutor:  # per process: a f
     return ThreadPoolExecutor(threads, thread_name_prefix=f"vg2gt-{process}")
 
 
-def compilable(*tensors: Tensor, dtype: torch.dtype = torch.float32) -> bool:
-    """Whether all tensors are ``dtype`` on a CPU and ``torch.compile``, which cannot trace kernels, is not active."""
-    suits = all(tensor.device.type == "cpu" and tensor.dtype == dtype for tensor in tensors)
-    return suits and not torch.compiler.is_compiling()
+def compilable(*tensors: Tensor) -> bool:
+    """Whether compiled kernels can process all tensors: whether they are float32 on a CPU."""
+    return all(tensor.device.type == "cpu" and tensor.dtype == torch.float32 for tensor in tensors)
 
 
 def over_voxels(voxels: int, run: Callable[[int, int], None]) -> None:

@@ -1,4 +1,4 @@
-"""The compiled passes of :mod:`vg2gt.method.additions.voxel_normals`."""
+"""The compiled pass of :mod:`vg2gt.method.additions.voxel_normals`."""
 
 from __future__ import annotations
 
@@ -12,65 +12,7 @@ from vg2gt.kernels.compiled import kernel
 from vg2gt.kernels.compiled_math import exp
 from vg2gt.kernels.threads import over_voxels
 
-I1, I2, I3, I4, I5, I8, I9 = (np.uintp(number) for number in (1, 2, 3, 4, 5, 8, 9))  # unsigned: no negative indices
-
-
-def facing_compiled(spread: Tensor, facing: Tensor, prior: float) -> Tensor:
-    """Returns directions ``[M, 3]`` of least variance in ``spread`` ``[M, 3, 3]``, towards ``facing`` ``[M, 3]``."""
-    normal = facing.new_empty(facing.shape)
-    arrays = [values.detach().flatten().numpy() for values in (spread, facing, normal)]
-    over_voxels(len(normal), lambda first, last: _face(*arrays, prior, first, last))
-    return normal
-
-
-@kernel(fastmath={"contract", "nsz", "arcp"}, error_model="numpy", nogil=True)
-def _face(spread, facing, normal, prior, first, last):
-    """Writes the normals of voxels ``first .. last - 1``, by the steps of ``smallest_eigenvector`` in float64.
-
-    The smallest eigenvalue is ``mean - (1 + t) radius``. ``t^2 (t + 3)`` is known; Newton's method finds ``t``.
-    """
-    for voxel in range(np.uintp(first), np.uintp(last)):
-        row, cell = I3 * voxel, I9 * voxel
-        u, v, w = np.float64(facing[row]), np.float64(facing[row + I1]), np.float64(facing[row + I2])
-        xx = spread[cell] + prior * (1.0 - u * u)
-        yy = spread[cell + I4] + prior * (1.0 - v * v)
-        zz = spread[cell + I8] + prior * (1.0 - w * w)
-        xy = spread[cell + I1] - prior * (u * v)
-        xz = spread[cell + I2] - prior * (u * w)
-        yz = spread[cell + I5] - prior * (v * w)
-        largest = max(max(max(abs(xx), abs(yy)), max(abs(zz), abs(xy))), max(abs(xz), abs(yz)))
-        scale = 1.0 / max(largest, 1e-300)
-        xx, yy, zz, xy, xz, yz = xx * scale, yy * scale, zz * scale, xy * scale, xz * scale, yz * scale
-        mean = (xx + yy + zz) / 3.0
-        xx, yy, zz = xx - mean, yy - mean, zz - mean
-        square = (xx * xx + yy * yy + zz * zz + 2.0 * (xy * xy + xz * xz + yz * yz)) / 6.0
-        radius = math.sqrt(square)
-        determinant = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
-        known = min(max(2.0 - determinant / max(square * radius, 1e-300), 0.0), 4.0)  # t^2 (t + 3)
-        root = math.sqrt(known / 3.0)
-        part = 1.0 + root * (0.034 * root - 0.154)  # t / root, error 0.0012; after two steps 3e-13
-        for _ in range(2):
-            part -= ((root * part + 3.0) * part * part - 3.0) / (3.0 * part * (root * part + 2.0))
-        below = radius * (1.0 + root * part)
-        xx, yy, zz = xx + below, yy + below, zz + below
-        nx, ny, nz = xy * yz - xz * yy, xz * xy - xx * yz, xx * yy - xy * xy
-        longest = nx * nx + ny * ny + nz * nz
-        cx, cy, cz = xy * zz - xz * yz, xz * xz - xx * zz, xx * yz - xy * xz
-        length = cx * cx + cy * cy + cz * cz
-        if length > longest:
-            nx, ny, nz, longest = cx, cy, cz, length
-        cx, cy, cz = yy * zz - yz * yz, yz * xz - xy * zz, xy * yz - yy * xz
-        length = cx * cx + cy * cy + cz * cz
-        if length > longest:
-            nx, ny, nz, longest = cx, cy, cz, length
-        if longest > 1e-12:
-            share = 1.0 / math.sqrt(longest)
-            if nx * u + ny * v + nz * w < 0.0:
-                share = -share
-            nx, ny, nz = nx * share, ny * share, nz * share
-        else:
-            nx, ny, nz = u, v, w
-        normal[row], normal[row + I1], normal[row + I2] = nx, ny, nz
+I1 = np.uintp(1)  # unsigned: no negative indices
 
 
 def spread_around(

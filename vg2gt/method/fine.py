@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -13,9 +13,10 @@ from torch.nn import functional as F
 from vg2gt.geometry.cameras import camera_centers, focal_lengths, unproject
 from vg2gt.geometry.precision import full_precision
 from vg2gt.geometry.symmetric import UPPER
-from vg2gt.kernels.point_moments import Moments
+from vg2gt.kernels.point_features import PooledFeatures
+from vg2gt.kernels.threads import compilable
 from vg2gt.memory import Cap, note_sizes
-from vg2gt.method.additions.point_moments import pool_point_moments
+from vg2gt.method.additions.point_moments import Moments, pool_point_moments
 from vg2gt.method.additions.silhouette import on_surface
 from vg2gt.method.additions.voxel_normals import surface_normals
 from vg2gt.method.dense_head import DenseHead
@@ -25,12 +26,12 @@ from vg2gt.method.grid import (
     plan_voxels,
     point_cells,
     pool_mean,
+    pool_mean_of_chunks,
     pool_min,
     scene_counts,
     scene_voxel_size,
     warn_if_sparse,
 )
-from vg2gt.method.point_features import pool_point_features, pool_point_features_of_chunks
 from vg2gt.method.point_mlp import PointMLP
 from vg2gt.method.pooled import MOMENTS, PooledVoxels
 from vg2gt.types import Geometry, Tokens, VoxelMoments, Voxels
@@ -56,8 +57,6 @@ class FineModule(nn.Module):
         point_mlp: factory of the voxel network, called with ``in_channels``.
         voxel_size: edge length in scene units.
         min_footprint: smallest edge in pixels at the scene's median depth; 0 disables this bound.
-        coarsest_drawn: training multiplies the smallest edge by a factor drawn log-uniformly from 1 to this value, so
-            that one head supports several voxel sizes.
         max_voxels: largest number of voxels per scene; above it the least confident are dropped, with a warning in the
             log and the metric ``train/voxels_dropped``. None keeps all.
         moments: whether to pool second moments of the points too, as further inputs of the voxel network and for the
@@ -72,7 +71,7 @@ class FineModule(nn.Module):
         cap: counts the voxels that ``max_voxels`` drops.
 
     Raises:
-        ValueError: if ``max_voxels`` or ``coarsest_drawn`` is below 1, or ``normal_kernel`` is neither 1 nor 3.
+        ValueError: if ``max_voxels`` is below 1, or ``normal_kernel`` is neither 1 nor 3.
     """
 
     def __init__(
@@ -87,16 +86,12 @@ class FineModule(nn.Module):
         moments: bool = False,
         normal_kernel: int = 1,
         drop_fringes: bool = False,
-        coarsest_drawn: float = 1.0,
     ) -> None:
         super().__init__()
-        if not coarsest_drawn >= 1:
-            raise ValueError(f"model.fine.coarsest_drawn must be at least 1, got {coarsest_drawn}")
         if normal_kernel not in (1, 3):
             raise ValueError(f"model.fine.normal_kernel must be 1 or 3, got {normal_kernel}")
         self.voxel_size = voxel_size
         self.min_footprint = min_footprint
-        self.coarsest_drawn = coarsest_drawn
         self.cap = Cap("model.fine.max_voxels", max_voxels, "voxels", "least confident")
         self.dense_head = dense_head(token_dims=token_dims, patch_size=patch_size)
         width = self.dense_head.out_channels
@@ -122,9 +117,6 @@ class FineModule(nn.Module):
         Raises:
             ValueError: if a scene spans too many voxels to index.
         """
-        if self.training and self.coarsest_drawn > 1:
-            drawn = self.coarsest_drawn ** torch.rand(len(images), device=images.device)
-            coarsen = drawn if coarsen is None else coarsen * drawn
         with full_precision(images):
             size = scene_voxel_size(geometry, self.voxel_size, self.min_footprint, coarsen)
         return self._refine(self._measure(tokens, geometry, images, size, capped=True), size)
@@ -277,3 +269,44 @@ def _scene_medians(values: Tensor, batch: Tensor, scenes: int) -> Tensor:
     """Returns for every voxel the median of the ``[M]`` values in its scene: ``[M]``."""
     parts = values.split(scene_counts(batch, scenes).tolist())
     return torch.stack([part.median() if len(part) else part.new_ones(()) for part in parts])[batch]
+
+
+def pool_point_features(dense: Tensor, offset: Tensor, weight: Tensor, confidence: Tensor, plan: VoxelPlan) -> Tensor:
+    """Returns ``sum n gelu(f + W o) / sum n`` over the points in every voxel (paper, eqn voxelfeature).
+
+    Args:
+        dense: ``[N, C]`` dense features f of the pixels.
+        offset: ``[N, 3]`` positions o within their cells, in [-1/2, 1/2].
+        weight: ``[C, 3]`` linear layer W from position to feature.
+        confidence: ``[N]`` n > 0.
+        plan: the voxels.
+
+    Returns:
+        ``[M, C]``, differentiable in all tensors. Compiled if they are float32 on a CPU: separate operations allocate
+        four arrays of all pixels' features.
+    """
+    if len(plan) and compilable(dense, offset, weight, confidence):
+        places = (plan.order, plan.starts, plan.counts, plan.voxel_of)
+        return PooledFeatures.apply(dense, offset, weight, confidence, *places)  # pyright: ignore[reportReturnType]
+    return pool_mean(point_features(dense, offset, weight), confidence, plan)
+
+
+@torch.no_grad()
+def pool_point_features_of_chunks(
+    chunks: Iterable[Tensor], offset: Tensor, weight: Tensor, confidence: Tensor, plan: VoxelPlan
+) -> Tensor:
+    """Computes :func:`pool_point_features` without gradient from consecutive chunks ``[n, C]`` of dense features."""
+    begin = 0
+
+    def features(dense: Tensor) -> Tensor:  # not a generator, which would hold a chunk while the next is computed
+        nonlocal begin
+        begin += len(dense)
+        return point_features(dense, offset[begin - len(dense) : begin], weight)
+
+    return pool_mean_of_chunks(map(features, chunks), confidence, plan)
+
+
+def point_features(dense: Tensor, offset: Tensor, weight: Tensor) -> Tensor:
+    """Returns ``gelu(dense + offset W^T)``, ``[N, C]``, in float32 under any autocast."""
+    with torch.autocast(dense.device.type, enabled=False):
+        return F.gelu(torch.addmm(dense.float(), offset, weight.t()))

@@ -233,10 +233,12 @@ def pool_mean_of_chunks(chunks: Iterable[Tensor], weights: Tensor, plan: VoxelPl
     means: Tensor | None = None
     begin = 0
     for values in chunks:
-        inside = ((plan.order >= begin) & (plan.order < begin + len(values))).nonzero()[:, 0]
-        rows = plan.order[inside] - begin
-        starts = torch.searchsorted(voxel[inside], torch.arange(len(plan), device=voxel.device))
-        part = F.embedding_bag(rows, values.to(dtype), starts, mode="sum", per_sample_weights=share[inside])
+        rows, starts, parts = plan.order, plan.starts, share
+        if len(values) < len(plan.voxel_of):
+            inside = ((plan.order >= begin) & (plan.order < begin + len(values))).nonzero()[:, 0]
+            rows, parts = plan.order[inside] - begin, share[inside]
+            starts = torch.searchsorted(voxel[inside], torch.arange(len(plan), device=voxel.device))
+        part = F.embedding_bag(rows, values.to(dtype), starts, mode="sum", per_sample_weights=parts)
         means = part if means is None else means.add_(part)
         begin += len(values)
     assert means is not None

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.utils.checkpoint import checkpoint
 
-from vg2gt.kernels.row_products import has_onednn, linear_rows
 from vg2gt.method.grid import scene_counts
 from vg2gt.method.serialization import Order, Windows, make_windows, relative_grid, serial_keys
 
@@ -27,8 +24,7 @@ class ResidualPointBlock(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Maps ``[..., C]`` to ``[..., C]``."""
-        hidden = linear_rows(self.norm(x), self.fc1.weight, self.fc1.bias, relu=True)
-        return x + linear_rows(hidden, self.fc2.weight, self.fc2.bias)
+        return x + self.fc2(self.fc1(self.norm(x)).relu_())
 
 
 class GeometricStage(nn.Module):
@@ -57,58 +53,34 @@ class GeometricStage(nn.Module):
         updates = []
         for group in windows.groups:
             rows = group.rows.flatten()
-            # windows per scene; the last scene includes those that own no voxels
-            sizes = (*group.counts[:-1], len(group.rows) - sum(group.counts[:-1]))
-            local = features.index_select(0, rows).unflatten(0, group.rows.shape).split(sizes)
-            place = positions.index_select(0, rows).unflatten(0, group.rows.shape).split(sizes)
-            first = [self._first_layer(*scene) for scene in zip(local, place, group.counts, strict=True)]
+            local = features.index_select(0, rows).unflatten(0, group.rows.shape).split(group.counts)
+            place = positions.index_select(0, rows).unflatten(0, group.rows.shape).split(group.counts)
+            first = [self._first_layer(*scene) for scene in zip(local, place, strict=True)]
             hidden = self.before(first[0] if len(first) == 1 else torch.cat(first))
-            context = self.after(window_max(hidden))
+            context = self.after(hidden.amax(1))
             # W_o [h | g], where g is the same for all voxels of a window
             weight_hidden, weight_context = self.out.weight.chunk(2, 1)
-            update = linear_rows(hidden, weight_hidden, self.out.bias) + F.linear(context, weight_context)[:, None]
+            update = F.linear(hidden, weight_hidden, self.out.bias) + F.linear(context, weight_context)[:, None]
             updates.append(update.flatten(0, 1))
         update = updates[0] if len(updates) == 1 else torch.cat(updates)
         return torch.addcmul(features, self.gamma, update.index_select(0, windows.owner))
 
-    def _first_layer(self, local: Tensor, place: Tensor, windows: int) -> Tensor:
-        """Affine and linear layer of a scene's windows ``[W, K, C]`` and ``[W, K, 3]``; ``windows`` own voxels."""
+    def _first_layer(self, local: Tensor, place: Tensor) -> Tensor:
+        """Affine and linear layer of a scene's windows ``[W, K, C]`` and ``[W, K, 3]``."""
         channels = local.shape[-1]
         of_affine, of_place, of_local = self.inner.weight.split((channels, 3, channels), 1)
         mean = local.mean(1)  # [W, C]
         local, place = local - mean[:, None], place.to(local.dtype)
         place = place - place.mean(1, keepdim=True)
-        of_affine = of_affine * (self.alpha[:channels] / _root_mean_square(local, windows))
-        of_place = of_place * (self.alpha[channels:] / _root_mean_square(place, windows))
+        of_affine = of_affine * (self.alpha[:channels] / _root_mean_square(local))
+        of_place = of_place * (self.alpha[channels:] / _root_mean_square(place))
         weight = torch.cat((of_affine + of_local, of_place), 1)
         constant = self.inner.bias + self.inner.weight[:, : channels + 3] @ self.beta + F.linear(mean, of_local)
-        return linear_rows(torch.cat((local, place), -1), weight) + constant[:, None]
+        return F.linear(torch.cat((local, place), -1), weight) + constant[:, None]
 
 
-def window_max(x: Tensor) -> Tensor:
-    """Returns ``x.amax(1)`` of ``[W, K, C]``; equal maxima share the gradient, in a quarter of torch's time."""
-    return _WindowMax.apply(x)  # pyright: ignore[reportReturnType]
-
-
-class _WindowMax(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, x: Tensor) -> Tensor:
-        """Returns ``[W, C]``."""
-        largest = x.amax(1)
-        ctx.save_for_backward(x, largest)
-        return largest
-
-    @staticmethod
-    def backward(ctx: Any, *grad_outputs: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Returns ``[W, K, C]``."""
-        x, largest = ctx.saved_tensors
-        # 0 and 1 directly in x's dtype: torch's own implementation converts booleans twice
-        share = torch.eq(x, largest[:, None], out=torch.empty_like(x))
-        return share.mul_((grad_outputs[0] / share.sum(1))[:, None])
-
-
-def _root_mean_square(deviation: Tensor, windows: int) -> Tensor:
-    square = torch.linalg.vector_norm(deviation).square() / (windows * deviation[0].numel())
+def _root_mean_square(deviation: Tensor) -> Tensor:
+    square = torch.linalg.vector_norm(deviation).square() / deviation.numel()
     # the inner constant keeps the root differentiable for single voxels
     return (square + 1e-10).sqrt() + 1e-5
 
@@ -169,8 +141,7 @@ class PointMLP(nn.Module):
         orders = STAGE_ORDERS[: len(self.stages)]
         counts = scene_counts(batch, len(voxel_size)).tolist()
         curves = [torch.argsort(key) for key in serial_keys(grid, batch, voxel_size, orders)]
-        few_sizes = has_onednn(grid.device)  # oneDNN compiles a convolution for every new size
         return [
-            make_windows(curves[i % len(curves)], counts, self.window, self.window // 2 * (i % 2), few_sizes)
+            make_windows(curves[i % len(curves)], counts, self.window, self.window // 2 * (i % 2))
             for i in range(len(self.stages))
         ]

@@ -73,8 +73,8 @@ class WindowGroup:
     """Windows of one length. Scenes with fewer voxels than the requested length are in groups of their own.
 
     Attributes:
-        rows: ``[W, K]`` voxels of every window, scene after scene. Windows at the end that own no voxels repeat one.
-        counts: number of windows per scene of this group, without those that own no voxels.
+        rows: ``[W, K]`` voxels of every window, scene after scene.
+        counts: number of windows per scene of this group.
     """
 
     rows: Tensor
@@ -96,13 +96,8 @@ class Windows:
     groups: tuple[WindowGroup, ...]
     owner: Tensor
 
-    def along(self, order: Tensor) -> Windows:
-        """Converts windows of curve positions to windows of the voxels ``order [M]`` along that curve."""
-        groups = tuple(WindowGroup(order[group.rows], group.counts) for group in self.groups)
-        return Windows(groups, torch.empty_like(order).scatter_(0, order, self.owner))
 
-
-def make_windows(order: Tensor, counts: list[int], length: int, shift: int = 0, few_sizes: bool = False) -> Windows:
+def make_windows(order: Tensor, counts: list[int], length: int, shift: int = 0) -> Windows:
     """Cuts the serialised voxels of every scene into windows.
 
     Args:
@@ -110,8 +105,6 @@ def make_windows(order: Tensor, counts: list[int], length: int, shift: int = 0, 
         counts: number of voxels per scene.
         length: voxels per window; a scene with fewer voxels is a single window.
         shift: the first window starts this many voxels before the scene, 0 <= shift < length.
-        few_sizes: whether to add windows that own no voxels, at most an eighth, so that groups have few different
-            sizes.
     """
     by_length: dict[int, list[tuple[int, int]]] = {}
     begin = 0
@@ -132,10 +125,5 @@ def make_windows(order: Tensor, counts: list[int], length: int, shift: int = 0, 
             owner[voxels] = base + window * size + place - inside[window]
             rows.append(voxels[inside[:, None] + torch.arange(size, device=order.device)])  # [W, K]
             base += len(inside) * size
-        windows = tuple(map(len, rows))
-        if few_sizes:
-            spare = -sum(windows) % (1 << max(sum(windows).bit_length() - 4, 0))
-            rows.append(rows[0][:1, :1].expand(spare, size))
-            base += spare * size
-        groups.append(WindowGroup(torch.cat(rows), windows))
+        groups.append(WindowGroup(torch.cat(rows), tuple(map(len, rows))))
     return Windows(tuple(groups), owner)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from vg2gt.geometry.symmetric import FULL, UPPER, smallest_eigenvector
 from vg2gt.kernels.threads import compilable
-from vg2gt.kernels.voxel_normals import facing_compiled, spread_around
+from vg2gt.kernels.voxel_normals import spread_around
 from vg2gt.method.grid import VoxelPlan, mixed_radix_keys
 
 FACING_PRIOR = 1e-4  # cells^2; without evidence, a surface faces its cameras
@@ -36,7 +36,7 @@ def surface_normals(spread: Tensor, facing: Tensor, offset: Tensor, plan: VoxelP
         kernel: edge length of the neighbourhood in cells, 1 or 3.
 
     Returns:
-        ``[M, 3]`` unit vectors. Compiled for float32 on a CPU.
+        ``[M, 3]`` unit vectors.
     """
     own = facing_normals(spread, facing)
     if kernel == 1 or not len(plan):
@@ -53,20 +53,14 @@ def facing_normals(spread: Tensor, facing: Tensor) -> Tensor:
         facing: ``[M, 3]`` unit vectors towards the cameras; used as the normal where the spread determines none.
 
     Returns:
-        ``[M, 3]`` unit vectors. Compiled for float32 on a CPU.
+        ``[M, 3]`` unit vectors.
     """
-    if compilable(spread, facing):
-        return facing_compiled(spread, facing, FACING_PRIOR)
-    return facing_reference(spread, facing)
-
-
-def facing_reference(spread: Tensor, facing: Tensor) -> Tensor:
-    """:func:`facing_normals` in plain torch."""
-    eye = torch.eye(3, dtype=spread.dtype, device=spread.device)
+    sight = facing.double()
+    eye = torch.eye(3, dtype=sight.dtype, device=sight.device)
     # a little variance perpendicular to the line of sight, which is then the normal where the spread determines none
-    prior = FACING_PRIOR * (eye - facing[:, :, None] * facing[:, None])
-    normal = smallest_eigenvector(spread + prior, facing)
-    return torch.where((normal * facing).sum(-1, keepdim=True) < 0, -normal, normal)
+    prior = FACING_PRIOR * (eye - sight[:, :, None] * sight[:, None])
+    normal = smallest_eigenvector(spread.double() + prior, sight)
+    return torch.where((normal * sight).sum(-1, keepdim=True) < 0, -normal, normal).to(facing.dtype)
 
 
 def around_reference(spread: Tensor, normal: Tensor, offset: Tensor, plan: VoxelPlan) -> Tensor:
