@@ -40,7 +40,6 @@ class GaussianHead(nn.Module):
         anchor: means are offsets from the voxel's ``centroid`` or, as in the paper, from its ``center``.
         start: ``plain``, or ``surfel``, which needs voxels with moments.
         max_offset: rho, largest predicted offset along an axis in voxels.
-        hidden: width of the hidden layer; None uses ``in_channels``.
         max_gaussians: largest number of Gaussians per scene; above it the least opaque are dropped, with a warning in
             the log and the metric ``train/gaussians_dropped``. None keeps all.
     """
@@ -53,7 +52,6 @@ class GaussianHead(nn.Module):
         anchor: Anchor = "centroid",
         start: Start = "plain",
         max_offset: float = 1.0,
-        hidden: int | None = None,
         max_gaussians: int | None = None,
     ) -> None:
         super().__init__()
@@ -73,8 +71,8 @@ class GaussianHead(nn.Module):
         self.cap = Cap("model.gaussians.max_gaussians", max_gaussians, "Gaussians", "least opaque")
         bands = (sh_degree + 1) ** 2
         self.parts = (3, 3, 4, 1, 3 * bands)
-        self.hidden = nn.Linear(in_channels, hidden or in_channels)
-        self.out = nn.Linear(hidden or in_channels, splits * sum(self.parts))
+        self.hidden = nn.Linear(in_channels, in_channels)
+        self.out = nn.Linear(in_channels, splits * sum(self.parts))
         # small random weights: with zeros, the K splits would stay identical
         nn.init.normal_(self.out.weight, std=0.02)
         nn.init.zeros_(self.out.bias)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from vg2gt.method.serialization import ORDERS, Order, Windows, make_windows, relative_grid, serial_keys
+from vg2gt.method.serialization import ORDERS, Windows, make_windows, relative_grid, serial_keys
 from vg2gt.method.sparse_conv import Cells, NeighborTable, Pairs, SubmanifoldConv3d, neighbors
 
 Norm = Literal["layer", "group", "batch"]
@@ -50,7 +50,6 @@ class Level:
         self.order = order
         count = len(keys)
         self.sequence = torch.randperm(count, generator=generator).tolist() if generator else list(range(count))
-        self._cuts: dict[int, Windows] = {}  # by length: windows of positions along any curve
         self._windows: dict[tuple[int, int], Windows] = {}
         self.pairs: dict[int, Pairs | NeighborTable] = {}
 
@@ -58,10 +57,7 @@ class Level:
         """Returns the attention windows along the curve of block number ``order``."""
         which = self.sequence[order % len(self.sequence)]
         if (which, length) not in self._windows:
-            if length not in self._cuts:
-                places = torch.arange(len(self.batch), device=self.batch.device)
-                self._cuts[length] = make_windows(places, self.counts, length)
-            self._windows[which, length] = self._cuts[length].along(torch.argsort(self.keys[which]))
+            self._windows[which, length] = make_windows(torch.argsort(self.keys[which]), self.counts, length)
         return self._windows[which, length]
 
 
@@ -248,7 +244,6 @@ class PTv3(nn.Module):
         mlp_ratio: hidden width of the MLPs relative to their input.
         drop_path: largest probability of skipping a residual branch; it grows linearly with depth.
         norm: normalisation in stem, pooling and unpooling; blocks always use layer normalisation.
-        orders: serialisation orders; successive blocks use successive ones.
         legacy: passes only the skip connection to the convolution of each decoder stage's first block, as the official
             code does; needed to reproduce its results.
 
@@ -270,7 +265,6 @@ class PTv3(nn.Module):
         mlp_ratio: float = 4,
         drop_path: float = 0.3,
         norm: Norm = "layer",
-        orders: Sequence[Order] = ORDERS,
         legacy: bool = False,
     ) -> None:
         super().__init__()
@@ -283,7 +277,6 @@ class PTv3(nn.Module):
                 f"{len(dec_channels)}, {len(dec_depths)} and {len(dec_heads)}"
             )
         self.out_channels = dec_channels[0] if stages > 1 else enc_channels[0]
-        self.orders = tuple(orders)
         self.legacy = legacy
 
         stem = nn.ModuleDict(
@@ -297,7 +290,7 @@ class PTv3(nn.Module):
 
         def blocks(channels: int, heads: int, rates: list[float]) -> dict[str, nn.Module]:
             return {
-                f"block{i}": PTv3Block(channels, heads, window, i % len(self.orders), mlp_ratio, rate)
+                f"block{i}": PTv3Block(channels, heads, window, i % len(ORDERS), mlp_ratio, rate)
                 for i, rate in enumerate(rates)
             }
 
@@ -342,7 +335,7 @@ class PTv3(nn.Module):
         extent: list[int] = (local.amax(0) + 1).tolist()
         # every pooling removes one bit per axis from the keys
         bits = max(1, len(self.enc) - 1)
-        keys = serial_keys(local, batch, voxel_size, self.orders, bits, max(extent))
+        keys = serial_keys(local, batch, voxel_size, ORDERS, bits, max(extent))
         kernels = [{self.stem_kernel, 3}, *[{3}] * (len(self.enc) - 1)]
         levels = make_levels(local, batch, len(voxel_size), keys, extent, [[*sizes] for sizes in kernels], generator)
         # stem: [M, in_channels] to [M, enc_channels[0]]
