@@ -90,21 +90,22 @@ def validating(act: Callable[[], None]) -> None:
     [torch.no_grad(), pytest.param(torch.inference_mode(), marks=pytest.mark.slow), validating],
     ids=["no_grad", "inference_mode", "validation step"],
 )
-def test_the_check_does_not_depend_on_what_surrounds_the_first_render(surrounded, monkeypatch):
+def test_the_check_does_not_depend_on_what_surrounds_the_first_render(surrounded, tmp_path, monkeypatch):
     """The real check, of one mode; its error was taken for a disagreement wherever gradients were off."""
     monkeypatch.setattr(selfcheck, "compare", partial(selfcheck.compare, modes=("rasterized",)))
+    monkeypatch.setattr(selfcheck, "cache_folder", lambda: tmp_path)
     selfcheck._refusal.cache_clear()
     act = partial(selfcheck.require_trusted, torch.device("cpu"))
     if surrounded is validating:
         validating(act)
     else:
         surrounded(act)()
-    assert selfcheck._refusal.cache_info().misses == 1
+    assert (tmp_path / "gpu_agreement.json").is_file()
 
 
 @pytest.fixture
-def checks(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Devices that were checked, on a machine that pretends to have some."""
+def checks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
+    """Devices that were checked, on a machine that pretends to have some; what is found is kept in ``tmp_path``."""
     asked: list[str] = []
 
     def compare(device: torch.device) -> Agreement:
@@ -113,6 +114,7 @@ def checks(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
     monkeypatch.setattr(selfcheck, "compare", compare)
     monkeypatch.setattr(selfcheck, "identity", lambda device: f"device {device}, triton 3")
+    monkeypatch.setattr(selfcheck, "cache_folder", lambda: tmp_path)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
     selfcheck._refusal.cache_clear()
     return asked
@@ -121,6 +123,8 @@ def checks(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def test_agreement_makes_auto_triton_and_is_found_out_once(checks: list[str]) -> None:
     assert renderer.automatic(torch.device("cpu")) == "cpu"
     assert renderer.automatic(GPU) == renderer.automatic(GPU) == "triton"
+    selfcheck._refusal.cache_clear()  # as in another process
+    assert (renderer.automatic(GPU), checks) == ("triton", ["cuda"])
     assert renderer.automatic(torch.device("cuda", 1)) == "triton"  # another device is another matter
     assert checks == ["cuda", "cuda:1"]
 
@@ -136,28 +140,39 @@ def test_agreement_makes_auto_triton_and_is_found_out_once(checks: list[str]) ->
 )
 def test_disagreement_is_an_error_that_says_what_to_report_and_what_to_choose(checks, found, monkeypatch):
     monkeypatch.setattr(selfcheck, "compare", lambda *_: found)
-    with pytest.raises(KernelsRefusedError, match="disagree with the reference: max image error") as error:
-        renderer.automatic(GPU)
-    assert "Please report this line: device cuda, triton 3. To render without these kernels" in str(error.value)
+    for again in (False, True):  # the next process knows it, too
+        with pytest.raises(KernelsRefusedError, match="disagree with the reference: max image error") as error:
+            renderer.automatic(GPU)
+        assert "Please report this line: device cuda, triton 3. To render without these kernels" in str(error.value)
+        if not again:
+            selfcheck._refusal.cache_clear()
 
 
-@pytest.mark.usefixtures("checks")
-def test_kernels_that_do_not_run_are_an_error_and_are_tried_once(monkeypatch):
+def test_kernels_that_do_not_run_are_an_error_and_are_tried_again_by_the_next_process(checks, monkeypatch):
     tries = []
 
     def broken(*_: Any) -> Agreement:
         tries.append(1)
         raise RuntimeError("no C compiler\nwas found")
 
-    monkeypatch.setattr(selfcheck, "compare", broken)
-    for _ in range(2):
-        with pytest.raises(KernelsRefusedError, match=r"do not run \(RuntimeError: no C compiler was found\)"):
-            renderer.automatic(GPU)
+    with monkeypatch.context() as patched:
+        patched.setattr(selfcheck, "compare", broken)
+        for _ in range(2):
+            with pytest.raises(KernelsRefusedError, match=r"do not run \(RuntimeError: no C compiler was found\)"):
+                renderer.automatic(GPU)
     assert len(tries) == 1
+    selfcheck._refusal.cache_clear()
+    assert renderer.automatic(GPU) == "triton"
 
 
 def test_a_gpu_without_triton_is_told_so(checks: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(KernelsRefusedError, match=r"triton.* is not installed\. .*renderer\.implementation=cpu"):
+    with pytest.raises(KernelsRefusedError, match=r"triton.* is not installed\. .*renderer\.implementation=torch"):
         renderer.automatic(GPU)
     assert renderer._resolve("cpu", GPU) == "cpu"
+
+
+def test_what_was_found_holds_for_these_kernels_alone() -> None:
+    """The kernels' sources are part of what an agreement is kept for."""
+    names = {path.name for path in selfcheck.SOURCES if path.is_file()}
+    assert {"tiles.py", "projection.py", "binning.py", "harmonics.py", "gpu_tiles.py"} <= names

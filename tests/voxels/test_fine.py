@@ -171,3 +171,18 @@ def test_fringes_of_silhouettes_make_no_voxels(make_fine, make_room):
 
     assert between(kept) > 0
     assert between(clean) == 0
+
+
+def test_training_draws_voxel_sizes_and_inference_does_not(make_fine, make_room):
+    tokens, geometry, images = make_room(scenes=2)
+    module = make_fine(min_footprint=6.0, coarsest_drawn=3.0)
+    torch.manual_seed(0)
+    coarsen = torch.tensor([1.0, 2.0])
+    plain = module.eval()(tokens, geometry, images, coarsen).voxel_size
+    module.train()
+    factors = torch.stack([module(tokens, geometry, images, coarsen).voxel_size / plain for _ in range(8)])
+    assert 1 <= factors.min() < 1.5
+    assert 2 < factors.max() <= 3
+    assert (factors[:, 0] != factors[:, 1]).all()
+    with pytest.raises(ValueError, match=r"model\.fine\.coarsest_drawn must be at least 1, got 0.5"):
+        make_fine(coarsest_drawn=0.5)

@@ -57,6 +57,8 @@ class FineModule(nn.Module):
         point_mlp: factory of the voxel network, called with ``in_channels``.
         voxel_size: edge length in scene units.
         min_footprint: smallest edge in pixels at the scene's median depth; 0 disables this bound.
+        coarsest_drawn: training multiplies the smallest edge by a factor drawn log-uniformly from 1 to this value, so
+            that one head supports several voxel sizes.
         max_voxels: largest number of voxels per scene; above it the least confident are dropped, with a warning in the
             log and the metric ``train/voxels_dropped``. None keeps all.
         moments: whether to pool second moments of the points too, as further inputs of the voxel network and for the
@@ -82,6 +84,7 @@ class FineModule(nn.Module):
         point_mlp: Callable[..., PointMLP],
         voxel_size: float = 0.002,
         min_footprint: float = 1.0,
+        coarsest_drawn: float = 1.0,
         max_voxels: int | None = None,
         moments: bool = False,
         normal_kernel: int = 1,
@@ -90,8 +93,11 @@ class FineModule(nn.Module):
         super().__init__()
         if normal_kernel not in (1, 3):
             raise ValueError(f"model.fine.normal_kernel must be 1 or 3, got {normal_kernel}")
+        if not coarsest_drawn >= 1:
+            raise ValueError(f"model.fine.coarsest_drawn must be at least 1, got {coarsest_drawn}")
         self.voxel_size = voxel_size
         self.min_footprint = min_footprint
+        self.coarsest_drawn = coarsest_drawn
         self.cap = Cap("model.fine.max_voxels", max_voxels, "voxels", "least confident")
         self.dense_head = dense_head(token_dims=token_dims, patch_size=patch_size)
         width = self.dense_head.out_channels
@@ -117,6 +123,9 @@ class FineModule(nn.Module):
         Raises:
             ValueError: if a scene spans too many voxels to index.
         """
+        if self.training and self.coarsest_drawn > 1:
+            drawn = self.coarsest_drawn ** torch.rand(len(images), device=images.device)
+            coarsen = drawn if coarsen is None else coarsen * drawn
         with full_precision(images):
             size = scene_voxel_size(geometry, self.voxel_size, self.min_footprint, coarsen)
         return self._refine(self._measure(tokens, geometry, images, size, capped=True), size)

@@ -1,22 +1,26 @@
 """Self-check of a device's compiled kernels against the reference, run once before their first use.
 
-Two small fixed scenes are rendered by the kernels on the device and by the dense reference in float64 on the CPU, once
-per process.
+Two small fixed scenes are rendered by the kernels on the device and by the dense reference in float64 on the CPU. The
+result is cached per device, driver, versions and kernel sources.
 """
 
 from __future__ import annotations
 
+import hashlib
 import importlib.metadata
 import importlib.util
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import lru_cache
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from vg2gt.geometry.rotations import quat_to_matrix
+from vg2gt.io.files import read_json, write_json
+from vg2gt.kernels.compiled import cache_folder
 from vg2gt.rendering.dense import rasterize_dense
 from vg2gt.rendering.options import Mode, RenderOptions
 from vg2gt.rendering.scenes import render_scenes
@@ -30,6 +34,11 @@ MODES: tuple[Mode, ...] = ("solid", "rasterized")
 SCENES, COUNT, SIZE, VIEWS, DEGREE = 2, 7, (9, 11), 2, 2  # COUNT: Gaussians per scene; DEGREE: as in model=vg2gt
 STREAM = 44  # seed of the scenes, with which three quarters of the rays have a well-conditioned depth
 ROWS = 8  # gradient rows held at once: fewer than a view has, so that views are processed one by one
+_VG2GT = Path(__file__).resolve().parents[1]
+SOURCES = (
+    Path(__file__).resolve(), _VG2GT / "rendering" / "gpu_tiles.py",
+    *sorted((_VG2GT / "kernels" / "render_gpu").glob("*.py")),
+)  # fmt: skip
 ADVICE = (
     "To render without these kernels (many times slower), use renderer.implementation=cpu (vg2gt reconstruct) "
     "or --device cpu (other commands)"
@@ -74,25 +83,29 @@ def require_trusted(device: torch.device) -> None:
         KernelsRefusedError: if they disagree with the reference, do not run, or Triton is not installed; the message
             says what to report and which option renders without them.
     """
-    if why := _refusal(device):
-        raise KernelsRefusedError(f"the Triton kernels {why}. Please report this line: {identity(device)}. {ADVICE}")
+    found_on = identity(device)
+    if importlib.util.find_spec("triton") is None:
+        raise KernelsRefusedError(f"rendering on {found_on} requires triton, which is not installed. {ADVICE}")
+    if why := _refusal(found_on, str(device)):
+        raise KernelsRefusedError(f"the Triton kernels {why}. Please report this line: {found_on}. {ADVICE}")
 
 
 @lru_cache
-def _refusal(device: torch.device) -> str:
+def _refusal(found_on: str, device: str) -> str:
     """Returns what is wrong with the kernels; empty if nothing is."""
-    if importlib.util.find_spec("triton") is None:
-        return "require triton, which is not installed"
-    try:
-        agreement = compare(device)
-    except Exception as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        return f"do not run ({type(error).__name__}: {reason[:300]})"
+    agreement = known(found_on)
+    if agreement is None:
+        try:
+            agreement = compare(torch.device(device))
+        except Exception as error:
+            reason = " ".join(str(error).split()) or type(error).__name__
+            return f"do not run ({type(error).__name__}: {reason[:300]})"
+        remember(found_on, agreement)
     return "" if agreement.good else f"disagree with the reference: {agreement}"
 
 
 def identity(device: torch.device) -> str:
-    """Returns the device, its driver and the versions of torch and Triton, for reports."""
+    """Returns the cache key of a result: device, driver, versions of torch and Triton, hash of the kernel sources."""
     name, driver = device.type, ""
     if device.type == "cuda":
         name = torch.cuda.get_device_name(device)
@@ -100,7 +113,31 @@ def identity(device: torch.device) -> str:
         driver = f"driver {version() if version else 'unknown'}, CUDA {torch.version.cuda or torch.version.hip}, "
     with suppress(importlib.metadata.PackageNotFoundError):
         driver += f"triton {importlib.metadata.version('triton')}, "
-    return f"{name}, {driver}torch {torch.__version__}"
+    source = hashlib.sha256(b"".join(path.read_bytes() for path in SOURCES))
+    return f"{name}, {driver}torch {torch.__version__}, kernels {source.hexdigest()[:12]}"
+
+
+def known(found_on: str) -> Agreement | None:
+    """Returns the cached result, or None."""
+    with suppress(OSError, ValueError, TypeError, KeyError):
+        return Agreement(**read_json(_file())[found_on])
+    return None
+
+
+def remember(found_on: str, agreement: Agreement) -> None:
+    """Caches a result, if the cache folder is writable."""
+    with suppress(OSError, TypeError):
+        before = {}
+        with suppress(OSError, ValueError):
+            before = read_json(_file())
+        write_json(_file(), {**before, found_on: asdict(agreement)})
+
+
+def _file() -> Path:
+    folder = cache_folder()
+    if folder is None:
+        raise OSError("no folder to keep it in")
+    return folder / "gpu_agreement.json"
 
 
 def compare(device: torch.device, modes: tuple[Mode, ...] = MODES) -> Agreement:
