@@ -167,7 +167,7 @@ def test_kernels_that_do_not_run_are_an_error_and_are_tried_again_by_the_next_pr
 
 def test_a_gpu_without_triton_is_told_so(checks: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(KernelsRefusedError, match=r"triton.* is not installed\. .*renderer\.implementation=torch"):
+    with pytest.raises(KernelsRefusedError, match=r"triton.* is not installed\. .*renderer\.implementation=cpu"):
         renderer.automatic(GPU)
     assert renderer._resolve("cpu", GPU) == "cpu"
 

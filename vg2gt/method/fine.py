@@ -73,7 +73,7 @@ class FineModule(nn.Module):
         cap: counts the voxels that ``max_voxels`` drops.
 
     Raises:
-        ValueError: if ``max_voxels`` is below 1, or ``normal_kernel`` is neither 1 nor 3.
+        ValueError: if ``max_voxels`` or ``coarsest_drawn`` is below 1, or ``normal_kernel`` is neither 1 nor 3.
     """
 
     def __init__(
