@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import logging
 import math
 import os
@@ -81,6 +82,7 @@ class Run:
 def build(config: DictConfig) -> Run:
     """Instantiates the module, data and trainer of a configuration; each constructor is the schema of its section."""
     _check(config)
+    _check_loggers(config)
     lightning.seed_everything(config.seed, workers=True, verbose=False)
     accelerator = _accelerator(config.trainer.accelerator)
     if accelerator == "gpu":
@@ -112,6 +114,14 @@ def build(config: DictConfig) -> Run:
         default_root_dir=config.output_dir,
     )
     return Run(module, datamodule, trainer, Path(config.output_dir))
+
+
+def _check_loggers(config: DictConfig) -> None:
+    """Raises ImportError if a logger's package is missing, naming the extra that installs it."""
+    chosen = [str(logger._target_) for logger in config.logger.values() if logger]
+    for ending, package in (("TensorBoardLogger", "tensorboard"), ("WandbLogger", "wandb")):
+        if any(target.endswith(ending) for target in chosen) and importlib.util.find_spec(package) is None:
+            raise ImportError(f"logger={package} needs {package}: pip install 'vg2gt[log]'")
 
 
 def _quieten_lightning() -> None:
