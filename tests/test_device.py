@@ -16,8 +16,8 @@ from tests.reliability.steps import TINY, first_batches
 from tests.training_helpers import NARROW, small_config
 from vg2gt.evaluation.in_training import evaluate_scene
 from vg2gt.kernels import curve_codes
-from vg2gt.method import knn, point_features, sparse_conv
-from vg2gt.method.additions import point_moments, voxel_normals
+from vg2gt.method import fine, knn, sparse_conv
+from vg2gt.method.additions import voxel_normals
 from vg2gt.profiling import listening
 from vg2gt.reconstruction.pipeline import reconstruct_with
 from vg2gt.rendering import renderer, selfcheck
@@ -53,7 +53,7 @@ def as_on_a_gpu(monkeypatch: pytest.MonkeyPatch) -> Any:
     """Makes a CPU run what a GPU runs: no compiled passes, and the kernels as ``auto``'s choice once checked."""
 
     def switch() -> None:
-        for module in (knn, voxel_normals, point_features, point_moments, curve_codes):
+        for module in (knn, fine, voxel_normals):
             monkeypatch.setattr(module, "compilable", lambda *_, **__: False)
         monkeypatch.setattr(sparse_conv, "one_by_one", lambda device: False)
         monkeypatch.setattr(curve_codes, "has_kernel", lambda device: True)
