@@ -8,6 +8,7 @@ from omegaconf import OmegaConf
 import vg2gt
 from vg2gt.config import compose_groups
 from vg2gt.memory import OutOfMemory
+from vg2gt.method import FineModule
 from vg2gt.runs.checkpoints import read_checkpoint, write_checkpoint, write_slim
 from vg2gt.runs.load import SHIPPED, load_model, made_of, resolve_parts
 from vg2gt.runs.trust import read_run_config
@@ -25,7 +26,9 @@ def test_options_change_parts(run_folder: Path) -> None:
     overrides = ["backend.depth_noise=0.5", "backend.taps=4", "model.fine.max_voxels=50", "renderer.near=0.5"]
     for backend in ("oracle", None):  # named again, or the run's own
         loaded = load_model(run_folder, backend, overrides, device="cpu")
-        assert (loaded.model.backend.depth_noise, loaded.model.get_submodule("fine").cap.limit) == (0.5, 50)
+        fine = loaded.model.get_submodule("fine")
+        assert isinstance(fine, FineModule)
+        assert (loaded.model.backend.depth_noise, fine.cap.limit) == (0.5, 50)
         assert loaded.renderer.near == 0.5
 
 
