@@ -10,6 +10,8 @@ from torch.nn import functional as F
 from torch.utils.checkpoint import checkpoint
 
 from backends.positions import uv_embedding
+from vg2gt.geometry.precision import full_precision
+from vg2gt.types import Tokens
 
 POSITION_WEIGHT = 0.1
 HIDDEN = 32
@@ -154,3 +156,16 @@ def in_chunks(head: nn.Module, tokens: Sequence[Tensor], grid: tuple[int, int], 
         chunks = zip(*(tap.split(chunk) for tap in flat), strict=True)
         out = torch.cat([checkpoint(head, part, grid, use_reentrant=False) for part in chunks])
     return out.unflatten(0, tokens[0].shape[:2])
+
+
+def decode_depth(head: nn.Module, tokens: Tokens, chunk: int | None) -> tuple[Tensor, Tensor]:
+    """Decodes z-depth (> 0) and confidence (> 1), each ``[B, V, H, W]``, with a head of two channels, in float32.
+
+    Args:
+        head: the DPT.
+        tokens: tokens of all views.
+        chunk: see :func:`in_chunks`.
+    """
+    with full_precision(tokens.camera):
+        out = in_chunks(head, tokens.patch, tokens.grid, chunk)  # [B, V, 2, H, W]
+    return out[:, :, 0].exp(), 1 + out[:, :, 1].exp()

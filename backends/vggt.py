@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from backends.dpt import DPT, in_chunks
+from backends.dpt import DPT, decode_depth
 from backends.network import NetworkBackend, decode_pose, normalize_images, predict
 from backends.positions import grid_positions, resize_position_embedding, rotary_2d
 from backends.vit import PatchEmbed, ViTBlock, ViTMLP, first_and_others
@@ -162,9 +162,7 @@ class VGGTDecoder(nn.Module):
 
     def decode(self, tokens: Tokens, chunk: int | None) -> Geometry:
         """See :meth:`Backend.decode`; the depth head runs on at most ``chunk`` views at a time."""
-        with full_precision(tokens.camera):
-            out = in_chunks(self.depth_head, tokens.patch, tokens.grid, chunk)  # [B, V, 2, H, W]
-        depth, confidence = out[:, :, 0].exp(), 1 + out[:, :, 1].exp()
+        depth, confidence = decode_depth(self.depth_head, tokens, chunk)
         return Geometry(depth, confidence, self.decode_cameras(tokens), torch.ones_like(depth[:, 0, 0, 0]))
 
     def decode_cameras(self, tokens: Tokens) -> Cameras:

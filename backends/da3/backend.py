@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from backends.da3.backbone import Backbone, ReferenceView
-from backends.dpt import DPT, in_chunks
+from backends.dpt import DPT, decode_depth
 from backends.network import NetworkBackend, decode_pose, encode_pose, normalize_images, predict
 from backends.vit import FeedForward, ViTBlock, ViTMLP
 from backends.weights import Weights
@@ -88,9 +88,7 @@ class DA3Decoder(nn.Module):
 
     def decode(self, tokens: Tokens, chunk: int | None) -> Geometry:
         """See :meth:`Backend.decode`; the depth head runs on at most ``chunk`` views at a time."""
-        with full_precision(tokens.camera):
-            out = in_chunks(self.head, tokens.patch, tokens.grid, chunk)  # [B, V, 2, H, W]
-        depth, confidence = out[:, :, 0].exp(), 1 + out[:, :, 1].exp()
+        depth, confidence = decode_depth(self.head, tokens, chunk)
         return Geometry(depth, confidence, self.decode_cameras(tokens), torch.ones_like(depth[:, 0, 0, 0]))
 
     def decode_cameras(self, tokens: Tokens) -> Cameras:

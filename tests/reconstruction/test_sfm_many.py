@@ -115,6 +115,16 @@ def test_the_largest_model_with_points_comes_first(tmp_path: Path, monkeypatch) 
         assert sfm._map(tmp_path / folder, 8, Monitor()) == taken
 
 
+def test_parts_share_no_image() -> None:
+    """Capital letters are images without a camera."""
+    models = [
+        SimpleNamespace(images={name: SimpleNamespace(name=name, has_pose=name.islower()) for name in names})
+        for names in ("abcD", "cdxyZ", "yz", "ab")
+    ]
+    found = sfm._parts(models)  # pyright: ignore[reportArgumentType]
+    assert found == [{"a", "b", "c"}, {"d", "x", "y"}, {"z"}, set()]
+
+
 @pytest.mark.slow
 def test_turned_photographs_are_placed(shared: Path, tmp_path: Path) -> None:
     """Every third lies on its side, without a word of it in its EXIF data: another lens, another size."""

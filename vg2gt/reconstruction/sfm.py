@@ -171,14 +171,14 @@ def _solve(pictures: Sequence[Picture], folder: Path, key: str, monitor: Monitor
                 f"cannot find the cameras of these {len(pictures)} images: too few overlap, taken from nearby but "
                 f"different positions; {ADVICE}"
             )
-        placed, *parts = map(_placed, models)
+        placed, *others = _parts(models)
         _write(models[0], work)
         titles = {name: picture.name for name, picture in zip(names, pictures, strict=True)}
         state = {
             "key": key,
             "images": {name: title for name, title in titles.items() if name in placed},
             "left_out": [title for name, title in titles.items() if name not in placed],
-            "other_parts": [[titles[name] for name in sorted(part - placed)] for part in parts if part - placed],
+            "other_parts": [[titles[name] for name in sorted(part)] for part in others if part],
             "points": models[0].num_points3D(),
         }
         with whole_folder(folder) as staged:
@@ -317,8 +317,13 @@ def _map(work: Path, count: int, monitor: Monitor) -> list[Reconstruction]:
     return sorted(sound, key=lambda model: (model.num_reg_images(), model.num_points3D()), reverse=True)
 
 
-def _placed(model: Reconstruction) -> set[str]:
-    return {image.name for image in model.images.values() if image.has_pose}
+def _parts(models: Sequence[Reconstruction]) -> list[set[str]]:
+    """Returns the names of the images that have a camera in each model and in none before it."""
+    parts: list[set[str]] = []
+    for model in models:
+        placed = {image.name for image in model.images.values() if image.has_pose}
+        parts.append(placed.difference(*parts))
+    return parts
 
 
 def _descriptors(database: Path, names: Sequence[str]) -> list[NDArray[np.uint8]]:
