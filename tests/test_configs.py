@@ -80,7 +80,7 @@ def test_every_option_composes_and_fits_its_constructor(tmp_path: Path, group: s
     config = composed(tmp_path, f"{group}={name}", *(["data.root=somewhere"] if name == "rgbd" else []))
     assert assert_signatures_fit(OmegaConf.to_container(config[group], resolve=True)) >= 1
     if group == "data" and name not in ("synthetic", "paper_mix"):  # scenes in files
-        assert {"every", "index_cache", "fit", "max_views"} <= set(config.data)
+        assert {"every", "index_cache", "max_views"} <= set(config.data)
 
 
 def test_devices_and_several_loggers(tmp_path: Path) -> None:

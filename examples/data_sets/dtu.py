@@ -19,13 +19,12 @@ from vg2gt.data.sources.files import FileSource, HoldoutOptions
 from vg2gt.data.sources.index import SceneIndex, check_found, first_size, make_index
 from vg2gt.data.sources.parsing import (
     check_intrinsics,
-    existing_depth_root,
     expanded,
     numbered,
     read_text_lines,
     rigid,
-    to_world,
 )
+from vg2gt.io.cameras_json import invert_pose
 from vg2gt.io.image_files import Size, read_depth
 from vg2gt.io.images import open_image
 
@@ -124,9 +123,8 @@ class DTU(FileSource):
         shared: see ``FileSource``.
     """
 
-    layout = "scans with images/ and cams/NNNNNNNN_cam.txt, there or one folder deeper"
+    layout = "scans with images/ and cams/NNNNNNNN_cam.txt, there or up to two folders deeper"
     scene_marks = ("images", "cams")
-    levels = 1
     index_options = ("depth", "depth_root")
 
     def __init__(
@@ -143,7 +141,7 @@ class DTU(FileSource):
             raise ValueError(f"depth={depth} needs depth_root, the folder of the {depth} files")
         self.depth = depth
         self.has_depth = depth is not None
-        self.depth_root = existing_depth_root(depth_root)
+        self.depth_root = expanded(depth_root)
         self._scan_depth = ScanDepth(expanded(depth_cache))
         super().__init__(root, **shared)
 
@@ -211,7 +209,7 @@ def _read_camera(path: Path, scene: str) -> tuple[NDArray[np.float64], NDArray[n
     pose[:3, 3] *= MILLIMETRE
     if np.isfinite(pose).all():
         pose = rigid(pose[None], [0], f"{path} of scene {scene}")[0]
-    return to_world(pose), intrinsics
+    return invert_pose(pose), intrinsics
 
 
 def _read_cameras(

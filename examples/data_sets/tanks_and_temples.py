@@ -50,8 +50,7 @@ class TanksAndTemples(FileSource):
         shared: see ``FileSource``.
     """
 
-    layout = f"scenes S with S{_LOG}, S_trans.txt and images, there or one folder deeper"
-    levels = 1
+    layout = f"scenes S with S{_LOG}, S_trans.txt and images, there or up to two folders deeper"
     index_options = ("intrinsics", "has_depth")
 
     def __init__(

@@ -19,7 +19,6 @@ from vg2gt.data.sources.parsing import (
     four_intrinsics,
     named_file,
     pinhole,
-    positive,
     read_matrix,
     read_numbers,
     read_text_lines,
@@ -59,9 +58,8 @@ class TUM(FileSource):
         shared: see ``FileSource``; the camera records 30 frames per second.
     """
 
-    layout = "rgb.txt, depth.txt and groundtruth.txt, there or one folder deeper"
+    layout = "rgb.txt, depth.txt and groundtruth.txt, there or up to two folders deeper"
     scene_marks = ("rgb.txt",)
-    levels = 1
     index_options = ("intrinsics", "max_difference")
     depth_scale = 5000.0
     invalid = (65535,)
@@ -75,7 +73,7 @@ class TUM(FileSource):
         **shared: Unpack[FileOptions],
     ) -> None:
         self.intrinsics = four_intrinsics(intrinsics)
-        self.max_difference = positive("max_difference", max_difference, "seconds")
+        self.max_difference = max_difference
         super().__init__(root, holdout=holdout, **shared)
 
     def index(self, scene: str, folder: Path) -> SceneIndex:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from examples.worlds import street
 from examples.worlds.outdoor import GROUND_COLORS, open_world
-from vg2gt.data.synthetic.builder import Builder
+from examples.worlds.street import Builder
 from vg2gt.data.synthetic.furniture import MAKERS
 from vg2gt.data.synthetic.renderer import World
 from vg2gt.data.synthetic.rooms import TRIES, SyntheticRoom, draw_lamps

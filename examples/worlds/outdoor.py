@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from examples.worlds import street
-from vg2gt.data.synthetic.builder import Builder
-from vg2gt.data.synthetic.renderer import World, draw_sky
+from examples.worlds.street import Builder
+from vg2gt.data.synthetic.renderer import World
 from vg2gt.data.synthetic.synthetic_scene import SyntheticScene, level_poses
 from vg2gt.data.synthetic.textures import Pattern
 
@@ -169,6 +169,14 @@ def _scatter(builder: Builder, plan: _Plan) -> None:
         make(builder)
 
 
+def _draw_sky(rng: np.random.Generator, sun: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Draws a sky ``[SKY_COLUMNS]`` with the sun in unit direction ``sun`` ``[3]``."""
+    blue = rng.uniform((0.08, 0.2, 0.5), (0.2, 0.36, 0.8))
+    haze = rng.uniform((0.5, 0.58, 0.65), (0.75, 0.75, 0.8))
+    clouds = (rng.uniform(0.0, 1.2), rng.uniform(0.5, 1.5), rng.integers(1 << 20))
+    return np.array([*haze, *blue, *sun, rng.uniform(0.1, 0.5), *clouds])
+
+
 def open_world(builder: Builder, ground: int, bounds: NDArray[np.float64]) -> World:
     """Finishes a world under a sky with a sun.
 
@@ -185,7 +193,7 @@ def open_world(builder: Builder, ground: int, bounds: NDArray[np.float64]) -> Wo
     lights = np.concatenate((_SUN_DISTANCE * sun, color))[None]
     ambient = float(rng.uniform(0.35, 0.55))
     materials = np.full(6, ground)
-    return World(bounds, materials, lights=lights, ambient=ambient, sky=draw_sky(rng, sun), **builder.arrays())
+    return World(bounds, materials, lights=lights, ambient=ambient, sky=_draw_sky(rng, sun), **builder.arrays())
 
 
 def _camera_path(rng: np.random.Generator, count: int) -> NDArray[np.float64]:

@@ -10,7 +10,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from vg2gt.data.synthetic.builder import Builder, Vector
+from vg2gt.data.synthetic import builder
+from vg2gt.data.synthetic.builder import Vector
 from vg2gt.data.synthetic.textures import INDOOR, Pattern
 
 GREENS: tuple[Vector, ...] = ((0.10, 0.24, 0.05), (0.2, 0.3, 0.07), (0.06, 0.16, 0.06), (0.42, 0.22, 0.05))
@@ -25,6 +26,25 @@ _ROOFS: tuple[Vector, ...] = ((0.32, 0.1, 0.06), (0.12, 0.12, 0.13), (0.22, 0.15
 _GLASS: Vector = (0.05, 0.07, 0.1)
 _LEAVES = (Pattern.CLOUDS, Pattern.MOSAIC)
 _PLAIN = (Pattern.PLAIN,)
+
+
+class Builder(builder.Builder):
+    """A builder that also draws materials of given colours."""
+
+    def tinted_material(
+        self,
+        color: Vector,
+        kinds: tuple[Pattern, ...],
+        frequency: tuple[float, float],
+        other: Vector | None = None,
+    ) -> int:
+        """Draws a material near ``color`` (linear RGB); its second colour is near ``other`` or a shade of the first."""
+        material = self.new_material(kinds, frequency)
+        first = np.array(color) * self.rng.uniform(0.75, 1.3) * self.rng.uniform(0.9, 1.1, 3)
+        shade = self.rng.uniform(0.5, 0.8) if self.rng.random() < 0.5 else self.rng.uniform(1.25, 1.6)
+        second = first * shade if other is None else np.array(other) * self.rng.uniform(0.8, 1.2)
+        self.materials[material][3:9] = np.clip([*first, *second], 0.02, 1.0).tolist()
+        return material
 
 
 def pick(b: Builder, colors: tuple[Vector, ...]) -> Vector:

@@ -59,14 +59,6 @@ def test_weights_hold_when_the_number_of_views_varies():
     assert abs(share - 0.25) < 0.015
 
 
-def test_scenes_can_be_named_or_listed_in_a_file(tmp_path):
-    names = ["other/room-000050", "rooms/room-000003"]
-    (tmp_path / "train.txt").write_text("# chosen by hand\n" + "\n".join(names))
-    assert list(_mixture(scenes=str(tmp_path / "train.txt")).scenes) == names
-    with pytest.raises(DataError, match="no scene rooms/room-000099"):
-        _mixture(scenes=["rooms/room-000099"])
-
-
 def test_missing_roots_are_named_unless_their_weight_is_zero(tmp_path):
     parts, weights = {"rooms": SyntheticScenes(2), "disk": RGBDFolder}, {"rooms": 1, "disk": 1}
     assert Mixture(parts, {"rooms": 1, "disk": 0}, disk_root=None).sources.keys() == {"rooms"}

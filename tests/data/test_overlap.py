@@ -44,8 +44,6 @@ def _mixture(**parts: SceneSource) -> Mixture:
     ("train", "trained", "val", "scene"),
     [
         (Scans(1), "scene0001_00", OtherReader(1), "scene0001_01"),
-        (_mixture(scans=Scans(1), rooms=SyntheticScenes(2)), "scans/scene0001_00", OtherReader(1), "scene0001_01"),
-        (OtherReader(1), "scene0001_00", _mixture(scans=Scans(1)), "scans/scene0001_01"),
         (_mixture(scans=Scans(1)), "scans/scene0001_00", _mixture(mine=OtherReader(1)), "mine/scene0001_01"),
     ],
 )

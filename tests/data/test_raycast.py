@@ -79,7 +79,7 @@ def test_bounding_spheres_and_cones_lose_no_hit():
         assert culled == nearest_hit(every, nowhere_near, len(every), room.parts, room.walls, *origin, *d)
 
 
-@pytest.mark.parametrize("width", [0.01, 0.2, 0.7, 1.0, 2.5])
+@pytest.mark.parametrize("width", [0.01, 0.7, 2.5])
 def test_filtered_waves_are_means_of_the_sharp_ones(width):
     rng = np.random.default_rng(1)
     for x in rng.uniform(-3, 3, 20):

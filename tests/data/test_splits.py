@@ -6,7 +6,7 @@ from functools import partial
 import pytest
 
 from vg2gt.cli.data import splits as main
-from vg2gt.data import DataError, RGBDFolder, SyntheticScenes
+from vg2gt.data import DataError, Mixture, RGBDFolder, SyntheticScenes
 from vg2gt.data.sources.files import read_split
 from vg2gt.data.splits import split_scenes
 
@@ -31,6 +31,8 @@ def test_recordings_of_a_place_stay_together_and_one_place_cannot_be_divided():
         split_scenes(Floors(3), 0.5)
     with pytest.raises(ValueError, match="fraction"):
         split_scenes(Floors(30), 1.0)
+    with pytest.raises(DataError, match=r"a mixture is split part by part: .* one of a, b"):
+        split_scenes(Mixture({"a": source, "b": source}, {"a": 1, "b": 1}), 0.5)
 
 
 def test_the_command_writes_lists_that_the_data_module_takes(rooms, write_recording, tmp_path, capsys):

@@ -25,17 +25,6 @@ def one(seed: int = 0, **options) -> Worlds:
     return Worlds(1, first_seed=seed, **{"num_frames": 2, "size": SIZE, **options})
 
 
-def test_frames_follow_the_conventions(rooms):
-    frames = rooms.load("room-000001", [4, 0])
-    assert frames.images.shape == (2, 3, *SIZE)
-    assert frames.images.dtype == frames.depth.dtype == torch.float32
-    assert 0 <= frames.images.min() < frames.images.max() <= 1
-    assert frames.depth.min() > 0.05
-    assert frames.intrinsics[0, :2, 2].tolist() == [(SIZE[1] - 1) / 2, (SIZE[0] - 1) / 2]
-    rotation = frames.world_to_camera[:, :3, :3]
-    torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3).expand(2, 3, 3), atol=1e-6, rtol=0)
-
-
 def test_points_of_one_frame_are_where_another_frame_sees_them():
     """Points seen by frame 0 are cast again from frame 1, through the very position where they project."""
     room = SyntheticRoom(3, 8, LARGE)
@@ -140,15 +129,10 @@ def test_variants_take_turns(tmp_path):
     ("options", "message"),
     [
         ({"num_scenes": 0}, "num_scenes >= 1"),
-        ({"num_frames": 0}, "num_scenes >= 1"),
-        ({"first_seed": -1}, "num_scenes >= 1"),
         ({"variant": "orbit"}, "variant must be one of room, wide, outdoor, object, landmark, moving"),
-        ({"variant": []}, "variant must be one of"),
         ({"highlights": "bright"}, "highlights must be true, false or lobes; got 'bright'"),
         ({"exposure": -1}, "exposure is a standard deviation in stops, at least 0; got -1"),
         ({"jpeg": [95, 30]}, r"jpeg must be null or a range of qualities within \[1, 100\]; got \[95, 30\]"),
-        ({"jpeg": [30]}, r"got \[30\]"),
-        ({"jpeg": [0, 200]}, r"got \[0, 200\]"),
     ],
 )
 def test_impossible_options_are_refused(options, message):
@@ -166,7 +150,7 @@ def test_upright_images_have_their_field_of_view_upright():
 
 def test_exposure_and_jpeg_change_the_image_only(tmp_path):
     levels, ratios = [], []
-    for seed in range(12):
+    for seed in range(8):
         name, options = f"room-{seed:06d}", {"num_frames": 3, "size": (28, 56)}
         plain = one(seed, **options).load(name, [0, 1, 2])
         source = one(seed, **options, exposure=1.5, jpeg=[20, 60], cache_dir=str(tmp_path))

@@ -11,7 +11,6 @@ from examples.worlds.outdoor import SyntheticOutdoor
 from vg2gt.data.synthetic.builder import Builder
 from vg2gt.data.synthetic.raycast import AXES, HALF, KIND, PART_COLUMNS
 from vg2gt.data.synthetic.renderer import World, render_frame
-from vg2gt.data.synthetic.rooms import SyntheticRoom
 from vg2gt.data.synthetic.synthetic_scene import level_poses
 
 SIZE = (28, 56)
@@ -42,7 +41,7 @@ def test_the_seed_decides_the_world_and_highlights_its_colour_alone(kind):
 
 @pytest.mark.parametrize("kind", [SyntheticObject, SyntheticLandmark, SyntheticWideRoom])
 def test_cameras_are_outside_of_everything_and_inside_the_world(kind):
-    for seed in range(25):
+    for seed in range(10):
         scene = kind(seed, 16, SIZE)
         walls, position = scene.world.walls, places(scene)
         assert (position > walls[0] + 0.05).all()
@@ -57,7 +56,7 @@ def test_cameras_are_outside_of_everything_and_inside_the_world(kind):
     [(SyntheticOutdoor, 7, 0.5, (0.03, 0.5), 50, 91), (SyntheticLandmark, 5, 1, (0.2, 0.6), 150, 1000)],
 )
 def test_streets_and_landmarks_have_a_far_background_and_a_sky_without_depth(kind, last, nearest, sky, far, farthest):
-    depth = np.array([[frame.depth for frame in kind(seed, 8, SIZE).render([0, last], 1)] for seed in range(12)])
+    depth = np.array([[frame.depth for frame in kind(seed, 8, SIZE).render([0, last], 1)] for seed in range(8)])
     assert depth[depth > 0].min() > nearest  # nothing is on the camera's path
     assert sky[0] < (depth == 0).mean() < sky[1]
     assert np.median(depth.max((2, 3))) > far
@@ -74,17 +73,6 @@ def test_culling_and_the_sun_lose_no_hit():
     culled, full = (render_frame(world, pose, scene.intrinsics, SIZE) for world in (scene.world, plain))
     assert np.array_equal(culled.depth, full.depth)
     assert (culled.image != full.image).mean() < 1e-3  # a ray that grazes two parts
-
-
-def test_a_wide_room_is_the_room_of_its_seed_seen_from_all_around():
-    steps = []
-    for seed in range(8):
-        room, wide = SyntheticRoom(seed, 12, SIZE), SyntheticWideRoom(seed, 12, SIZE)
-        assert np.array_equal(room.world.parts, wide.world.parts)
-        assert np.array_equal(room.world.materials, wide.world.materials)
-        steps.append([np.linalg.norm(np.diff(places(each), axis=0), axis=1).mean() for each in (room, wide)])
-    narrow, spread = np.mean(steps, 0)
-    assert spread > 5 * narrow
 
 
 def test_a_point_looks_the_same_from_everywhere_unless_it_shines():

@@ -28,10 +28,8 @@ def machine(monkeypatch):
     [
         ({}, 1, MOST),
         ({}, 8, 7),  # a core for the rank itself
-        ({"cores": 8}, 8, 0),
         ({"memory": 32}, 2, 4),
         ({"shared": 0.064}, 1, 0),  # a container's
-        ({"shared": 1}, 1, 8),
     ],
 )
 def test_cores_and_memory_bound_the_loaders(here, ranks, expected, machine):

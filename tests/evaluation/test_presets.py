@@ -40,7 +40,6 @@ def test_the_papers_presets_are_the_papers(preset: str) -> None:
     read = {
         "data": get_class(config.data.val._target_).__name__,
         "size": (config.data.image_size[0], config.data.image_size[1]),
-        "fit": config.data.fit,
         "alignment": options.alignment,
         "depth_range": options.depth_range,
     }

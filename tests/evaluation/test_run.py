@@ -182,8 +182,6 @@ def test_what_is_missing_or_wrong_is_named(tmp_path: Path, cache: Path, trained:
     (tmp_path / "empty" / "checkpoints").mkdir(parents=True)
     with pytest.raises(FileNotFoundError, match=r"ckpt=.*empty: no valid checkpoint in .*null for none"):
         run(tmp_path, cache, f"ckpt={tmp_path / 'empty'}")
-    with pytest.raises(DataError, match=r"no scene to evaluate: data\.eval_scenes"):
-        run(tmp_path, cache, "data.eval_scenes=0")
     for device in ("banana", "cuda:99"):
         with pytest.raises(ValueError, match=f"device={device} is not available"):
             run(tmp_path, cache, f"device={device}")

@@ -28,7 +28,6 @@ def report(**settings: Any) -> dict[str, Any]:
         "scenes": 1,
         "index": "replica",
         "size": [518, 518],
-        "fit": "cover",
         "alignment": "median",
         "depth_range": [None, None],
         "neighbors": 8,
@@ -70,7 +69,6 @@ def test_the_papers_rows_stand_beside_ours() -> None:
 PAPERS = {
     "data": "Replica",
     "size": (518, 518),
-    "fit": "cover",
     "alignment": "median",
     "depth_range": [None, None],
     "told": False,
@@ -83,7 +81,6 @@ PAPERS = {
         ("data", "SyntheticScenes", "read by SyntheticScenes, which is not the paper's replica"),
         ("data", "ScanNet", "read by ScanNet"),
         ("size", (112, 224), "images are 112x224"),
-        ("fit", "pad", "518x518 \\(pad\\)"),
         ("alignment", "none", "aligned by none"),
         ("depth_range", [None, 10], r"within \[None, 10\]"),
         ("told", True, "given true depth"),

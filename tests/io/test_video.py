@@ -36,6 +36,8 @@ def test_round_trip(tmp_path: Path, suffix: str, height: int, error: float) -> N
         assert frame.shape == (height, 48, 3)
         assert np.abs(frame.astype(int) - _frames(size=(33, 48))[number][:height]).mean() < error
         assert np.array_equal(read_frame(path, number), frame)
+    with pytest.raises(FormatError, match=r"has 6 frames, but frame 6 was requested"):
+        read_frame(path, 6)
 
 
 def test_frames_come_upright_and_mirrored_as_the_file_says(tmp_path: Path) -> None:

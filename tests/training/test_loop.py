@@ -144,10 +144,8 @@ REFUSED: list[tuple[list[str], str | None]] = [
     *(
         (["overwrite=true", override], message)
         for override, message in {
-            "data.train_scenes=0": r"data\.train_scenes=0 must be at least 1",
             "data.workers=-1": r"data\.workers=-1 must be at least 0",
-            "data.eval_scenes=0": r"data\.eval_scenes=0.*at least 1, or null for all",
-            "data.memory_mb=-1": r"data\.memory_mb=-1.*at least 0",
+            "data.eval_scenes=0": r"data\.eval_scenes=0 must be at least 1",
             "optimizer.lr=-1": r"optimizer: Invalid learning rate: -1",
             "optimizer.lr=0": r"optimizer\.lr=0.*a positive number",
             "loss.geometry=null": r"loss\.geometry=null does not turn anything off",

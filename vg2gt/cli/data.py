@@ -36,8 +36,7 @@ def splits(argv: Sequence[str] | None = None) -> None:
     parser = flag_parser("data splits", SPLITS)
     add = parser.add_argument
     add("--out", type=Path, required=True, metavar="DIR", help="where train.txt and val.txt are written")
-    add("--fraction", type=float, default=0.1, metavar="X", help="fraction of the places for val.txt, default 0.1; "
-        "applies to every part of a mixture")  # fmt: skip
+    add("--fraction", type=float, default=0.1, metavar="X", help="fraction of the places for val.txt, default 0.1")
     add("--seed", type=int, default=0, metavar="N", help="random seed of the split, default 0")
     options = parser.parse_args(given)
     with errors_in_one_line():

@@ -8,7 +8,7 @@ import signal
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from lightning.pytorch import LightningDataModule
@@ -17,12 +17,11 @@ from torch.utils.data import DataLoader
 from vg2gt.data.base import DataError, SceneSource, SourceMaker
 from vg2gt.data.batches import BatchDataset
 from vg2gt.data.overlap import refuse_overlap, refuse_untrainable
-from vg2gt.data.transforms import resize_to_cover, resize_to_fit
+from vg2gt.data.transforms import resize_to_cover
 from vg2gt.data.views.even import EvaluationViews
 from vg2gt.data.views.sampling import StepSampler, ViewSampler, usable_scenes
 from vg2gt.types import Batch
 
-_FITS = {"cover": resize_to_cover, "pad": resize_to_fit}
 PIXEL_BYTES = 4 * (3 + 1 + 1)  # float32 colour, depth and the mask of some datasets
 
 MOST = 16  # worker limit: more would wait for the disk
@@ -40,7 +39,8 @@ class SceneDataModule(LightningDataModule):
     Args:
         train: training scenes, or a factory (``_partial_: true``), which is called with ``common``.
         val: evaluation scenes, or a factory.
-        image_size: ``(height, width)`` of every image, preferably multiples of the backbone's patch size.
+        image_size: ``(height, width)`` that frames are resized to cover and cropped to, preferably multiples of the
+            backbone's patch size.
         train_scenes: use at most this many training scenes; None: all.
         eval_scenes: use at most this many evaluation scenes; None: all.
         min_views: minimum number of context views in a training step.
@@ -57,8 +57,6 @@ class SceneDataModule(LightningDataModule):
         workers: loader processes; 0 decodes in the training process; None: as many as cores and memory allow when
             training on a GPU, else 0.
         memory_mb: size of the cache of decoded frames in each process, in MB.
-        fit: ``cover`` resizes frames until they cover ``image_size`` and crops; ``pad`` resizes them to fit into it and
-            pads with black, which has no depth.
         common: arguments shared by ``train`` and ``val``, such as the dataset's ``root``.
 
     Raises:
@@ -85,27 +83,17 @@ class SceneDataModule(LightningDataModule):
         seed: int = 0,
         workers: int | None = None,
         memory_mb: int = 1024,
-        fit: Literal["cover", "pad"] = "cover",
         **common: Any,
     ) -> None:
         super().__init__()
-        if train_scenes is not None and train_scenes < 1:
-            raise ValueError(f"data.train_scenes={train_scenes} must be at least 1, or null for all")
-        if eval_scenes is not None and eval_scenes < 0:
-            raise ValueError(f"data.eval_scenes={eval_scenes} must be at least 1, or null for all")
-        if not memory_mb >= 0:
-            raise ValueError(f"data.memory_mb={memory_mb} must be at least 0 (0: no cache of decoded frames)")
-        if workers is not None and workers < 0:
-            raise ValueError(
-                f"data.workers={workers} must be at least 0 (0: decode in the training process; null: choose by cores "
-                "and memory)"
-            )
+        limits = {"train_scenes": (train_scenes, 1), "eval_scenes": (eval_scenes, 1), "workers": (workers, 0)}
+        for name, (value, least) in (limits | {"memory_mb": (memory_mb, 0)}).items():
+            if value is not None and value < least:
+                raise ValueError(f"data.{name}={value} must be at least {least}")
         self.sampler = ViewSampler(min_views, max_views, max_images, expand_ratio, target_views, seed, view_sets)
         self.eval_views = EvaluationViews(eval_context, eval_target, eval_window)
-        if fit not in _FITS:
-            raise ValueError(f"data.fit must be one of {', '.join(_FITS)}, got {fit!r}")
         self.image_size = _size(image_size)
-        self.prepare = partial(_FITS[fit], size=self.image_size)
+        self.prepare = partial(resize_to_cover, size=self.image_size)
         self.common = common
         self.train_scenes = train_scenes
         self.eval_scenes = eval_scenes
@@ -129,8 +117,6 @@ class SceneDataModule(LightningDataModule):
         """
         if self._train is not None and self._val is not None:
             return
-        if self.eval_scenes == 0:
-            raise DataError("data.eval_scenes=0 leaves no scene to evaluate: it must be at least 1, or null for all")
         train, val = self.train_source(), self.val_source()
         refuse_untrainable(train)
         self._train_names = usable_scenes(train, self.sampler, self.train_scenes)

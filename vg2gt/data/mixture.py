@@ -7,7 +7,6 @@ from itertools import chain, zip_longest
 from typing import Any
 
 from vg2gt.data.base import DataError, Frames, SceneSource, SourceMaker
-from vg2gt.data.sources.files import read_split
 
 
 class Mixture(SceneSource):
@@ -20,20 +19,18 @@ class Mixture(SceneSource):
     Args:
         parts: datasets by name, or factories of them (``_partial_: true``).
         weights: sampling weight of every part, on any positive scale; a part of weight 0 is skipped and needs no data.
-        scenes: names of the scenes to use, or a text file with one per line; None: all.
         common: arguments of the factories: ``<part>_<argument>`` goes to one part, any other to all parts.
 
     Raises:
         ValueError: if parts and weights do not match.
         FileNotFoundError: if a part's root is not given or does not exist.
-        DataError: if a part has no scene, or a named scene does not exist.
+        DataError: if a part has no scene.
     """
 
     def __init__(
         self,
         parts: Mapping[str, SceneSource | SourceMaker],
         weights: Mapping[str, float],
-        scenes: Sequence[str] | str | None = None,
         **common: Any,
     ) -> None:
         _check(parts, weights)
@@ -43,7 +40,7 @@ class Mixture(SceneSource):
         self.has_depth = all(source.has_depth for source in self.sources.values())
         self.dense_depth = all(source.dense_depth for source in self.sources.values())
         self.has_cameras = all(source.has_cameras for source in self.sources.values())
-        self._scenes = _select(_interleave(self.sources), scenes)
+        self._scenes = _interleave(self.sources)
 
     @property
     def scenes(self) -> Sequence[str]:
@@ -126,16 +123,3 @@ def _owner(key: str, names: Sequence[str]) -> str | None:
 def _interleave(sources: Mapping[str, SceneSource]) -> list[str]:
     named = [[f"{part}/{scene}" for scene in source.scenes] for part, source in sources.items()]
     return [name for name in chain.from_iterable(zip_longest(*named)) if name is not None]
-
-
-def _select(found: list[str], scenes: Sequence[str] | str | None) -> tuple[str, ...]:
-    if scenes is None:
-        return tuple(found)
-    names = read_split(scenes) if isinstance(scenes, str) else list(scenes)
-    unknown = sorted(set(names) - set(found))
-    if unknown:
-        raise DataError(
-            f"the mixture has no scene {unknown[0]} ({len(unknown)} of the {len(names)} named are missing); its "
-            f"scenes are called part/scene, such as {found[0]}"
-        )
-    return tuple(names)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -11,42 +9,35 @@ import numpy as np
 from vg2gt.data.base import DataError, SceneSource
 from vg2gt.io.files import write_text
 
-log = logging.getLogger(__name__)
-
 
 def split_scenes(source: SceneSource, fraction: float, seed: int = 0) -> tuple[list[str], list[str]]:
-    """Splits scenes at random by place, separately for every part of a mixture.
+    """Splits scenes at random by place.
 
     Args:
-        source: the scenes.
-        fraction: fraction of each part's places that is used for evaluation, at least one place and never all; a part
-            with a single place is used for training only.
-        seed: random seed; the split depends only on it and on the names of parts and places.
+        source: the scenes; not a mixture, whose parts take a list each.
+        fraction: fraction of the places that is used for evaluation, at least one place and never all.
+        seed: random seed; the split depends only on it and on the names of the places.
 
     Returns:
         Names of the training scenes and of the evaluation scenes, in the source's order.
 
     Raises:
         ValueError: if ``fraction`` is not in (0, 1).
-        DataError: if every part has a single place.
+        DataError: if there is a single place, or the source is a mixture.
     """
     if not 0 < fraction < 1:
         raise ValueError(f"fraction must be within (0, 1), got {fraction}")
-    evaluation: set[str] = set()
-    for part in source.parts():
-        places = sorted({source.place(scene) for scene in source.scenes if source.part(scene) == part})
-        if len(places) < 2:
-            log.warning("%s contains a single place; it is used for training only", part or "the dataset")
-            continue
-        order = np.random.default_rng((seed, zlib.crc32(part.encode()))).permutation(len(places))
-        count = min(max(1, round(fraction * len(places))), len(places) - 1)
-        evaluation |= {places[place] for place in order[:count]}
-    if not evaluation:
-        place = source.place(source.scenes[0])
+    if len(source.parts()) > 1:
+        raise DataError(f"a mixture is split part by part: choose the dataset of one of {', '.join(source.parts())}")
+    places = sorted({source.place(scene) for scene in source.scenes})
+    if len(places) < 2:
         raise DataError(
-            f"the dataset shows a single place ({place}): hold frames out of training instead (data.holdout); or, if "
-            f"the scenes in a folder {place} are different places, name that folder: data.root=[.../{place}]"
+            f"the dataset shows a single place ({places[0]}): hold frames out of training instead (data.holdout); or, "
+            f"if the scenes in a folder {places[0]} are different places, name that folder: data.root=[.../{places[0]}]"
         )
+    order = np.random.default_rng((seed, 0)).permutation(len(places))
+    count = min(max(1, round(fraction * len(places))), len(places) - 1)
+    evaluation = {places[place] for place in order[:count]}
     in_val = {scene: source.place(scene) in evaluation for scene in source.scenes}
     return [scene for scene in in_val if not in_val[scene]], [scene for scene in in_val if in_val[scene]]
 

@@ -1,4 +1,4 @@
-"""Resizing, cropping and padding of frames together with their intrinsics."""
+"""Resizing and cropping of frames together with their intrinsics."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
-from torch.nn.functional import pad as constant_pad
 
 from vg2gt.data.base import Frames
 from vg2gt.geometry.cameras import crop_intrinsics, resize_intrinsics
@@ -71,23 +70,6 @@ def crop(frames: Frames, top: int, left: int, size: tuple[int, int]) -> Frames:
     )
 
 
-def pad(frames: Frames, top: int, left: int, size: tuple[int, int]) -> Frames:
-    """Pads frames with black to ``size`` (height, width), their first pixel at (``top``, ``left``).
-
-    The padding has depth 0 and mask 0.
-    """
-    height, width = frames.depth.shape[-2:]
-    mask = torch.ones_like(frames.depth) if frames.mask is None else frames.mask
-    margins = (left, size[1] - left - width, top, size[0] - top - height)
-    return replace(
-        frames,
-        images=constant_pad(frames.images, margins),
-        depth=constant_pad(frames.depth, margins),
-        intrinsics=crop_intrinsics(frames.intrinsics, -left, -top),
-        mask=constant_pad(mask, margins),
-    )
-
-
 def resize_to_cover(frames: Frames, size: tuple[int, int]) -> Frames:
     """Resizes frames until they cover ``size`` (height, width), keeping their aspect ratio, and crops the centre."""
     height, width = frames.depth.shape[-2:]
@@ -98,25 +80,13 @@ def resize_to_cover(frames: Frames, size: tuple[int, int]) -> Frames:
     return crop(resized, (covering[0] - size[0]) // 2, (covering[1] - size[1]) // 2, size)
 
 
-def resize_to_fit(frames: Frames, size: tuple[int, int]) -> Frames:
-    """Resizes frames to fit into ``size`` (height, width), keeping their aspect ratio, and pads around them."""
-    inner = _fitting(frames, size)
-    return pad(resize(frames, inner), (size[0] - inner[0]) // 2, (size[1] - inner[1]) // 2, size)
-
-
 def reduce_to_fit(frames: Frames, size: tuple[int, int]) -> Frames:
     """Shrinks frames until they just fit into ``size``, keeping their aspect ratio; smaller frames are unchanged."""
     height, width = frames.depth.shape[-2:]
-    if height <= size[0] and width <= size[1]:
-        return frames
-    return resize(frames, _fitting(frames, size))
-
-
-def _fitting(frames: Frames, size: tuple[int, int]) -> tuple[int, int]:
-    """Returns ``(height, width)`` of the largest frames of this aspect ratio that fit into ``size``."""
-    height, width = frames.depth.shape[-2:]
     scale = min(size[0] / height, size[1] / width)
-    return min(size[0], max(1, _whole(height * scale))), min(size[1], max(1, _whole(width * scale)))
+    if scale >= 1:
+        return frames
+    return resize(frames, (min(size[0], max(1, _whole(height * scale))), min(size[1], max(1, _whole(width * scale)))))
 
 
 def _whole(length: float) -> int:

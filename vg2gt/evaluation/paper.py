@@ -36,14 +36,14 @@ def obstacle(dataset: str, settings: Mapping[str, Any]) -> str | None:
 
     Args:
         dataset: name in the tables, such as ``replica``.
-        settings: ``data`` (name of the class that reads it), ``size`` and ``fit`` of the images, ``alignment`` and
+        settings: ``data`` (name of the class that reads it), ``size`` of the images, ``alignment`` and
             ``depth_range`` of an evaluation's report, and whether the backbone is ``told`` the data's depth or cameras.
     """
-    size, fit, alignment = settings["size"], settings["fit"], settings["alignment"]
+    size, alignment = settings["size"], settings["alignment"]
     if settings["data"] not in SOURCES.get(dataset, ()):
         return f"the data is read by {settings['data']}, which is not the paper's {dataset}"
-    if tuple(size) != RESOLUTION or fit != "cover":
-        return f"images are {size[0]}x{size[1]} ({fit}), the paper's 518x518 (cover)"
+    if tuple(size) != RESOLUTION:
+        return f"images are {size[0]}x{size[1]}, the paper's 518x518"
     if alignment != ALIGNMENT or any(bound is not None for bound in settings["depth_range"]):
         return (
             f"depth is aligned by {alignment} within {settings['depth_range']}, the paper's by {ALIGNMENT} without "

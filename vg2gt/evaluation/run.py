@@ -14,7 +14,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from vg2gt.config import flatten
-from vg2gt.data.base import DataError, SceneSource
+from vg2gt.data.base import SceneSource
 from vg2gt.data.batches import BatchDataset
 from vg2gt.data.datamodule import SceneDataModule
 from vg2gt.data.views import SceneSample
@@ -70,8 +70,6 @@ def _evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
     datamodule: SceneDataModule = instantiate(config.data)
     data = datamodule.evaluation_data()
     scenes = list(data.source.scenes)[: datamodule.eval_scenes]
-    if not scenes:
-        raise DataError(f"there is no scene to evaluate: data.eval_scenes takes none of {len(data.source.scenes)}")
     samples = {count: options.selection.choose(data.source, scenes, count) for count in counts}
     refuse_training_views(checkpoint, data.source, [view for views in samples.values() for view in views])
 
@@ -196,7 +194,6 @@ def _settings(
         "scenes": scenes,
         "index": options.selection.index or f"drawn with seed {options.selection.seed}",
         "size": [int(side) for side in config.data.image_size],
-        "fit": config.data.get("fit", "cover"),
         "alignment": options.alignment,
         "depth_range": list(options.depth_range),
         "neighbors": options.neighbors,

@@ -25,7 +25,7 @@ from vg2gt.uncertainty import LEVELS, Calibration, Samples, pixel_evidence
 def image_metrics(rendered: Render, truth: Batch, lpips: LPIPS | None = None) -> dict[str, float]:
     """``psnr``, ``ssim`` and, if a network is given, ``lpips`` of one scene, averaged over its views.
 
-    Masked pixels, such as the border of ``data.fit=pad``, count as correct, as in the loss.
+    Masked pixels count as correct, as in the loss.
     """
     images, color = truth.images[0], rendered.color[0]
     if truth.mask is not None:

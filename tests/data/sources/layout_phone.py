@@ -26,14 +26,14 @@ def record3d_metadata(frames: Frames) -> dict[str, Any]:
     return {"w": SIZE[1], "h": SIZE[0], "poses": poses, "K": [fx, 0, 0, 0, fy, 0, cx, cy, 1], "fps": 60}
 
 
-def write_r3d(root: Path, frames: Frames, packed: bool = True, told: bool = True) -> None:
+def write_r3d(root: Path, frames: Frames, packed: bool = True) -> None:
     """Record3D's own: a ZIP of JSON without an ending, and depth and confidence in LZFSE."""
     import lzfse  # pyright: ignore[reportMissingImports]: optional
 
     own = [(camera_of(frames) + CORNER).tolist()] * len(frames.images)
     content = record3d_metadata(frames)
     content |= {"K": [1.0, 0, 0, 0, 1, 0, 0, 0, 1], "perFrameIntrinsicCoeffs": own} if not packed else {}
-    content |= {"dw": SIZE[1], "dh": SIZE[0], "initPose": [0, 0, 0, 1, 0, 0, 0]} if told else {}
+    content |= {"dw": SIZE[1], "dh": SIZE[0], "initPose": [0, 0, 0, 1, 0, 0, 0]}
     files = {"metadata": json.dumps(content).encode(), "icon": b"a picture", "sound.m4a": b"a sound"}
     for i in range(len(frames.images)):
         files[f"rgbd/{i}.jpg"] = encoded(pixels(frames)[i])
@@ -90,6 +90,6 @@ LAYOUTS = {
     "stray_scanner": Layout(write_stray, READ, image_error=0.03),
 }
 if importlib.util.find_spec("lzfse"):
-    unpacked = partial(write_r3d, packed=False, told=False)
+    unpacked = partial(write_r3d, packed=False)
     LAYOUTS["r3d"] = Layout(write_r3d, READ, image_error=0.012, depth_quantum=1e-6)
     LAYOUTS["r3d_unpacked"] = Layout(unpacked, READ, image_error=0.012, depth_quantum=1e-6)

@@ -9,7 +9,7 @@ from tests.commands import ROOT
 from vg2gt.config import compose
 from vg2gt.data import SceneDataModule
 
-from . import layout_infinigen, layout_replica, layout_scannet, layout_tum
+from . import layout_infinigen, layout_replica, layout_scannet
 from .layouts import room
 
 
@@ -28,12 +28,6 @@ def _scannet(root: Path, *scenes: str) -> None:
     _lists(f"{root}/scannetv2_", *scenes)
 
 
-def _scannet_sens(root: Path, first: str, second: str) -> None:
-    path = layout_scannet.write_sens(root, room())
-    path.with_name(f"{second}.sens").write_bytes(path.read_bytes())
-    _lists(f"{root}/scannetv2_", first, second)
-
-
 def _scannetpp(root: Path, *scenes: str) -> None:
     for scene in scenes:
         layout_scannet.write_scannetpp(root, room())
@@ -47,12 +41,7 @@ def _replica(root: Path, *scenes: str) -> None:
         layout_replica.write(root, room(), scene)
 
 
-def _tum(root: Path, scene: str, _) -> None:
-    layout_tum.write(root, room(), scene)
-
-
 EXAMPLES = ROOT / "examples" / "data_sets" / "configs"
-TUM = "rgbd_dataset_freiburg1_desk"
 EVERY = "data.every=1"
 SMALL = ["data.image_size=[28,42]", "data.min_views=2", "data.max_views=2", "data.max_images=2", "data.eval_context=2"]
 
@@ -62,7 +51,6 @@ SMALL = ["data.image_size=[28,42]", "data.min_views=2", "data.max_views=2", "dat
     [
         ("infinigen", _infinigen, ["a"], ["a"], []),
         ("scannet", _scannet, ["scene0000_00"], ["scene0001_00"], [EVERY]),
-        ("scannet_sens", _scannet_sens, ["scene0707_00"], ["scene0708_00"], [EVERY]),
         ("scannetpp", _scannetpp, ["scene1"], ["scene2"], []),
         (
             "replica",
@@ -71,7 +59,6 @@ SMALL = ["data.image_size=[28,42]", "data.min_views=2", "data.max_views=2", "dat
             ["office4", "room2"],
             [EVERY, "data.intrinsics=[27,27,19.5,14.5]"],
         ),
-        ("tum", _tum, [TUM], [TUM], [EVERY]),
     ],
 )
 def test_scenes_are_split_and_batched(tmp_path, name, write, train, val, changes):

@@ -8,7 +8,7 @@ from vg2gt.data import DataError
 from vg2gt.data.sources import Replica
 
 
-def write(root, size, frames=(0, 1, 2), lines=3):
+def write(root, size, frames, lines):
     """Frames of one size; the camera moves along x."""
     folder = root / "room1" / "results"
     folder.mkdir(parents=True)
@@ -21,20 +21,13 @@ def write(root, size, frames=(0, 1, 2), lines=3):
 
 
 def test_intrinsics_are_those_of_1200x680_and_images_of_another_shape_need_some(tmp_path):
-    write(tmp_path / "full", (680, 1200), frames=(0,))
+    write(tmp_path / "full", (680, 1200), frames=[0], lines=1)
     full = Replica(str(tmp_path / "full")).load("room1", [0])
     assert full.intrinsics[0].tolist() == [[600, 0, 599.5], [0, 600, 339.5], [0, 0, 1]]
     assert float(full.depth[0, 0, 0]) == pytest.approx(2.0)
-    write(tmp_path / "small", (17, 30))
-    given = Replica(str(tmp_path / "small"), intrinsics=[16, 17, 14, 9]).scene_index("room1")
-    assert given.intrinsics[0].tolist() == [[16, 0, 14], [0, 17, 9], [0, 0, 1]]
+    write(tmp_path / "small", (17, 30), frames=[1, 3], lines=5)  # of the video's frames only some were kept
+    given = Replica(str(tmp_path / "small" / "room1"), intrinsics=[16, 17, 14, 9])
+    assert given.scene_index("room1").intrinsics[0].tolist() == [[16, 0, 14], [0, 17, 9], [0, 0, 1]]
+    assert given.load("room1", [1, 3]).world_to_camera[:, 0, 3].tolist() == [-1, -3]
     with pytest.raises(DataError, match=r"scene room1 .* are 30x17, not 1200x680.*data.intrinsics=\[fx,fy,cx,cy\]"):
         Replica(str(tmp_path / "small")).frames("room1")
-
-
-def test_a_pose_is_the_line_of_its_frame_number(tmp_path):
-    """Of the video's frames only some were kept."""
-    write(tmp_path, (17, 30), frames=(1, 3), lines=5)
-    source = Replica(str(tmp_path / "room1"), intrinsics=[16, 17, 14, 9])
-    assert source.scenes == ("room1",)
-    assert source.load("room1", [1, 3]).world_to_camera[:, 0, 3].tolist() == [-1, -3]

@@ -1,6 +1,5 @@
 """ScanNet's own traps: unpadded numbers, lost poses, two sizes of images, several scans of one room; raw streams."""
 
-import logging
 import struct
 import zlib
 
@@ -22,11 +21,9 @@ SCENE = "scene0707_00"
 def test_frames_are_sorted_by_number_and_lost_ones_left_out(tmp_path, caplog, loader):
     write_export(tmp_path, room(4))
     np.savetxt(tmp_path / "scans" / SCENE / "pose" / "9.txt", np.full((4, 4), -np.inf))
-    with caplog.at_level(logging.INFO):
-        source = loader(str(tmp_path / "scans"))
-        assert source.frames(SCENE) == (8, 10, 11)
+    source = loader(str(tmp_path / "scans"))
+    assert source.frames(SCENE) == (8, 10, 11)
     assert "1 of 4 frames whose pose is not finite are left out" in caplog.text
-    assert loader is ScanNet or "folders color/ and depth/, 3 frames" in caplog.text
     assert torch.allclose(source.load(SCENE, [10]).world_to_camera[0], room(4).world_to_camera[2], atol=1e-6)
 
 
@@ -36,10 +33,6 @@ def test_scans_of_one_room_show_one_place(tmp_path):
     source = ScanNet(str(tmp_path))
     assert source.scenes == ("scene0706_00", SCENE, "scene0707_01")
     assert [source.place(scene) for scene in source.scenes] == ["scene0706", "scene0707", "scene0707"]
-    (tmp_path / "train.txt").write_text(f"{SCENE}\n")
-    assert ScanNet(str(tmp_path), scenes=str(tmp_path / "train.txt")).scenes == (SCENE,)
-    with pytest.raises(DataError, match=r"no such scene: scene9; available: scene0706_00"):
-        ScanNet(str(tmp_path), scenes=["scene9"])
     assert ScanNet(str(tmp_path / "scans" / SCENE)).scenes == (SCENE,)
 
 

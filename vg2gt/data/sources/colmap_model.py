@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,18 +15,18 @@ from vg2gt.data.sources.files import FileSource, HoldoutOptions
 from vg2gt.data.sources.index import PosedImage, SceneIndex, make_index
 from vg2gt.data.sources.masks import FOLDER as MASKS
 from vg2gt.data.sources.masks import find_masks
-from vg2gt.data.sources.parsing import IMAGE_SUFFIXES, errors_name, existing_image, named_file, to_world
+from vg2gt.data.sources.parsing import IMAGE_SUFFIXES, errors_name, existing_image, named_file
 from vg2gt.data.sources.sparse_points import SparsePoints
 from vg2gt.data.sources.undistortion import posed_image, size_on_disk
 from vg2gt.io import colmap_images, colmap_pose, read_colmap
-from vg2gt.io.colmap import Image, Reconstruction, colmap_files
-from vg2gt.io.image_files import Size, read_color
+from vg2gt.io.cameras_json import invert_pose
+from vg2gt.io.colmap import colmap_files
+from vg2gt.io.image_files import Size
 
 log = logging.getLogger(__name__)
 
 _MODELS = ("sparse", "colmap/sparse", ".")
 _SCENES_IN_MEMORY = 16
-_CLEARLY = 0.7  # the stored orientation is used if its colour difference is below this fraction of the upright one's
 
 
 class COLMAP(FileSource):
@@ -80,11 +79,13 @@ class COLMAP(FileSource):
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
         """Reads the model and the sizes of its images."""
-        model, model_folder = self._read_model(scene, folder)
-        records = colmap_images(model)
+        model_folder, *others = models_of(folder)
         where = f"{model_folder} of scene {scene}"
-        named = {i: named_file(folder / self.images, record.name, where) for i, record in enumerate(records)}
+        if others:
+            log.warning("%s is its largest COLMAP model; ignored: %s", where, ", ".join(map(str, others)))
         with errors_name(scene):
+            records = colmap_images(read_colmap(model_folder))
+            named = {i: named_file(folder / self.images, record.name, where) for i, record in enumerate(records)}
             color = {i: found for i, path in named.items() if (found := existing_image(path)) is not None}
         if not color:
             names = f"the first is {records[0].name}, expected at {named[0]}" if records else "it names none"
@@ -93,18 +94,18 @@ class COLMAP(FileSource):
                 "them there, or set data.images to the name of their folder"
             )
         masks = find_masks(folder / MASKS, {i: records[i].name for i in color}, f"scene {scene}")
-        poses = {i: to_world(colmap_pose(record)) for i, record in enumerate(records)}
-        posed = {i: self._posed(scene, where, model, records[i], path, masks.get(i)) for i, path in color.items()}
-        usable = {i: image for i, image in posed.items() if np.isfinite(image.intrinsics).all()}
-        if len(usable) < len(posed):
-            names = ", ".join(records[i].name for i in posed if i not in usable)
-            log.warning("scene %s: left out images whose camera parameters are not finite: %s", scene, names)
-            color = {i: path for i, path in color.items() if i in usable}
+        poses = {i: invert_pose(colmap_pose(record)) for i, record in enumerate(records)}
+        posed: dict[int, PosedImage] = {}
+        for i, path in color.items():
+            camera = records[i].camera
+            expected = (camera.height, camera.width)
+            size, upright = size_on_disk(path, scene, expected, where)
+            posed[i] = posed_image(camera, expected, size, upright, masks.get(i), f"{where}, {records[i].name}")
         depth = None
         if self.has_depth:
             points = self._scene_points(scene, folder)
             depth = {i: model_folder for i in color if len(points.depth(i))}
-        return make_index(scene, folder, color, depth, poses, {}, posed=usable)
+        return make_index(scene, folder, color, depth, poses, {}, posed=posed)
 
     def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
         """Returns depth at the pixels of the points that a view observes; the nearest point wins a pixel."""
@@ -119,33 +120,13 @@ class COLMAP(FileSource):
         """Returns the positive z-depth ``[n]`` of all points that a frame observes, including likely outliers."""
         return self._scene_points(scene, self._folders[scene], sound=False).depth(frame)
 
-    def _posed(
-        self, scene: str, where: str, model: Reconstruction, record: Image, path: Path, mask: Path | None
-    ) -> PosedImage:
-        camera = record.camera
-        if not np.any(camera.params):
-            return PosedImage((camera.height, camera.width), np.full((3, 3), np.nan))
-        expected = (camera.height, camera.width)
-        size, upright = size_on_disk(path, scene, expected, where, partial(_is_stored, model, record, path))
-        return posed_image(camera, expected, size, upright, mask, f"{where}, {record.name}")
-
     def _scene_points(self, scene: str, folder: Path, sound: bool = True) -> SparsePoints:
         if (scene, sound) not in self._points:
             if len(self._points) >= _SCENES_IN_MEMORY:
                 self._points.clear()
-            self._points[scene, sound] = SparsePoints(self._read_model(scene, folder)[0], sound)
+            with errors_name(scene):
+                self._points[scene, sound] = SparsePoints(read_colmap(models_of(folder)[0]), sound)
         return self._points[scene, sound]
-
-    def _read_model(self, scene: str, folder: Path) -> tuple[Reconstruction, Path]:
-        models = models_of(folder)
-        if not models:
-            raise DataError(f"scene {scene} has no COLMAP model in {folder}: expected sparse/0 or sparse")
-        if len(models) > 1:
-            names = [str(place.relative_to(folder)) for place in models]
-            message = "scene %s has %d COLMAP models: using %s, the largest, ignoring %s"
-            log.warning(message, scene, len(models), names[0], ", ".join(names[1:]))
-        with errors_name(scene):
-            return read_colmap(models[0]), models[0]
 
 
 def models_of(folder: Path) -> list[Path]:
@@ -168,18 +149,3 @@ def model_folder_of(folder: Path) -> Path | None:
 
 def _has_images(folder: Path) -> bool:
     return any(path.suffix.lower() in IMAGE_SUFFIXES or path.name == "images" for path in folder.iterdir())
-
-
-def _is_stored(model: Reconstruction, record: Image, path: Path) -> bool:
-    """Returns whether the model's point colours match an image clearly better as stored than rotated upright."""
-    camera, differences = record.camera, []
-    features = [feature for feature in record.points2D if feature.point3D_id in model.points3D]
-    if not features:
-        return False
-    expected = np.array([model.points3D[feature.point3D_id].color for feature in features], np.float64)
-    places = np.array([feature.xy for feature in features]) / (camera.width, camera.height)
-    for upright in (False, True):
-        pixels = read_color(path, "", upright=upright)
-        x, y = (places * pixels.shape[1::-1]).astype(np.int64).clip(0, np.array(pixels.shape[1::-1]) - 1).T
-        differences.append(np.abs(pixels[y, x] - expected).mean())
-    return bool(differences[0] < _CLEARLY * differences[1])

@@ -71,8 +71,6 @@ class FileSource(SceneSource):
     """Files and folders that a folder must contain to count as a scene."""
     scene_files: ClassVar[tuple[str, ...]] = ()
     """Suffixes of single files that count as scenes."""
-    levels: ClassVar[int] = 2
-    """Maximum depth of scene folders below ``root``."""
     names_are_paths: ClassVar[bool] = False
     """Whether a scene is named by its path relative to ``root`` instead of its folder name."""
     index_version: ClassVar[int] = 2
@@ -112,16 +110,14 @@ class FileSource(SceneSource):
         return all((folder / mark).exists() for mark in self.scene_marks)
 
     def find(self, root: Path) -> Mapping[str, Path]:
-        """Finds scenes by name, with their folder or file: ``root`` itself, or folders up to ``levels`` below it."""
+        """Finds scenes by name, with their folder or file: ``root`` itself, or folders up to two levels below it."""
         if self.is_scene(root):
             return {root.resolve().name: root}
         found: dict[str, Path] = {}
-        for depth in range(1, self.levels + 1):
-            for folder in sorted(root.glob("/".join("*" * depth))):
-                if (folder.is_dir() or folder.suffix.lower() in self.scene_files) and self.is_scene(folder):
-                    _add_scene(
-                        found, folder.relative_to(root).as_posix() if self.names_are_paths else folder.name, folder
-                    )
+        for folder in (*sorted(root.glob("*")), *sorted(root.glob("*/*"))):
+            if (folder.is_dir() or folder.suffix.lower() in self.scene_files) and self.is_scene(folder):
+                name = folder.relative_to(root).as_posix() if self.names_are_paths else folder.name
+                _add_scene(found, name, folder)
         return found
 
     @abstractmethod
@@ -130,7 +126,7 @@ class FileSource(SceneSource):
 
     def read_color(self, index: SceneIndex, row: int) -> NDArray[np.uint8]:
         """Decodes the colour image ``[h, w, 3]`` of a row of the index, undistorted."""
-        lens, upright = index.lens(row), index.upright(row)
+        lens, upright = index.lens(row), index.of_image("upright", row, False)
         if not lens:
             return read_color(index.color[row], index.name, index.color_size, upright=upright)
         undistortion = undistortion_of(lens)
@@ -140,10 +136,10 @@ class FileSource(SceneSource):
         """Reads the pixel weights ``[h, w]`` in [0, 1] of a colour image from its mask file and alpha; None: all 1."""
         if not self.reads_masks:
             return None
-        path, upright = index.mask(row), index.upright(row)
-        parts = [read_mask(index.color[row], index.name, upright=upright)]
-        if path is not None:
-            parts.append(read_mask_file(path, index.name, index.color[row] if upright else None))
+        color, upright = index.color[row], index.of_image("upright", row, False)
+        parts = [read_mask(color, index.name, upright=upright)]
+        if path := index.of_image("mask", row, ""):
+            parts.append(read_mask_file(Path(path), index.name, color if upright else None))
         mask = joined_masks(parts)
         if mask is None or not (lens := index.lens(row)):
             return mask
@@ -163,9 +159,7 @@ class FileSource(SceneSource):
         undistortion = undistortion_of(index.lens(row)) if index.lens(row) else None
         stored = read_depth(index.depth[row], index.name, undistortion.lens_size if undistortion else size)
         depth = stored / self.depth_scale
-        if self.invalid:
-            depth = np.where(np.isin(stored, self.invalid), 0, depth)
-        depth = depth.astype(np.float32)
+        depth = np.where(np.isin(stored, self.invalid), 0, depth).astype(np.float32)
         return undistortion.depth(depth) if undistortion else depth
 
     def watched(self, scene: str, folder: Path) -> Sequence[Path | None]:

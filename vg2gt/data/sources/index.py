@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence, Sized
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,21 +72,16 @@ class SceneIndex:
 
     def own_size(self, row: int) -> Size:
         """Returns ``(height, width)`` of a frame before it is resized to ``size``."""
-        height, width = self.extra["sizes"][row].tolist() if "sizes" in self.extra else self.size
+        height, width = self.of_image("sizes", row, self.size)
         return height, width
 
     def lens(self, row: int) -> str:
         """Returns the lens of a frame in the format of ``undistortion.lens_text``; empty for a pinhole."""
-        return str(self.extra["lens"][row]) if "lens" in self.extra else ""
+        return self.of_image("lens", row, "")
 
-    def upright(self, row: int) -> bool:
-        """Returns whether a frame's image is rotated upright according to its EXIF data."""
-        return bool(self.extra["upright"][row]) if "upright" in self.extra else False
-
-    def mask(self, row: int) -> Path | None:
-        """Returns the mask file of a frame, if it has one."""
-        name = str(self.extra["mask"][row]) if "mask" in self.extra else ""
-        return Path(name) if name else None
+    def of_image(self, name: str, row: int, otherwise: Any) -> Any:
+        """Returns a frame's value in ``extra``, or ``otherwise`` if the scene has none of that name."""
+        return self.extra[name][row].tolist() if name in self.extra else otherwise
 
 
 @dataclass(frozen=True)
@@ -96,7 +92,7 @@ class PosedImage:
         size: ``(height, width)`` of the image, upright and undistorted.
         intrinsics: ``[3, 3]`` for an image of that size, integer pixel centres.
         lens: see ``SceneIndex.lens``.
-        upright: see ``SceneIndex.upright``.
+        upright: whether it must be rotated upright according to its EXIF data.
         mask: path of the mask file, or empty.
     """
 
@@ -214,12 +210,10 @@ def folder_state(folder: Path) -> str:
 
     That of a folder changes when files are added or removed, or when a file directly in it is edited.
     """
-    if not folder.is_dir():
-        stat = folder.stat()
-        return json.dumps([str(folder), stat.st_mtime_ns, stat.st_size])
-    entries = [(path, path.stat()) for path in sorted(folder.iterdir())]
-    inner = [(path, path.stat()) for top, _ in entries if top.is_dir() for path in _folders_in(top)]
-    text = json.dumps([[str(path), stat.st_mtime_ns, stat.st_size] for path, stat in entries + inner])
+    entries = sorted(folder.iterdir()) if folder.is_dir() else [folder]
+    entries += [path for top in entries if top.is_dir() for path in _folders_in(top)]
+    states = [(path, path.stat()) for path in entries]
+    text = json.dumps([[str(path), state.st_mtime_ns, state.st_size] for path, state in states])
     return hashlib.sha256(text.encode()).hexdigest()
 
 

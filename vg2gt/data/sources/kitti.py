@@ -12,8 +12,8 @@ from typing_extensions import Unpack
 
 from vg2gt.data.base import DataError
 from vg2gt.data.sources.files import FileSource, HoldoutOptions
-from vg2gt.data.sources.index import SceneIndex, make_index
-from vg2gt.data.sources.parsing import existing_depth_root, numbered, read_numbers, read_text_lines, rigid
+from vg2gt.data.sources.index import SceneIndex, check_found, make_index
+from vg2gt.data.sources.parsing import expanded, numbered, read_numbers, read_text_lines, rigid
 from vg2gt.io.cameras_json import invert_pose
 
 EARTH_RADIUS = 6378137.0
@@ -56,7 +56,7 @@ class KITTI(FileSource):
     ) -> None:
         if split not in (None, *_SPLITS):
             raise ValueError(f"split must be train, val or null (both), got {split!r}")
-        self.depth_root = existing_depth_root(depth_root)
+        self.depth_root = expanded(depth_root)
         self.splits = (split,) if split else _SPLITS
         super().__init__(root, **shared)
 
@@ -73,12 +73,9 @@ class KITTI(FileSource):
         """Lists the files of a drive and computes its poses."""
         depth_folder = self._depth_folder(folder)
         depth = numbered(depth_folder, scene) if depth_folder else {}
-        if not depth:
-            raise DataError(f"scene {scene} has no annotated depth in {depth_folder}")
+        check_found(scene, folder, {"annotated depth": depth})
         numbers = range(min(depth), max(depth) + 1)
         color = {i: path for i, path in numbered(folder / _IMAGES, scene).items() if i in numbers}
-        if not color:
-            raise DataError(f"scene {scene} has depth of frames {numbers}, but no image of them in {folder}")
         intrinsics, camera_from_imu = read_calibration(folder.parent, scene)
         packets = numbered(folder / "oxts" / "data", scene, suffixes=(".txt",))
         imu = imu_to_world({number: _read_packet(path, scene) for number, path in packets.items()})

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,21 +15,13 @@ from vg2gt.data.sources.files import FileSource, HoldoutOptions
 from vg2gt.data.sources.index import PosedImage, SceneIndex, make_index
 from vg2gt.data.sources.masks import FOLDER as MASKS
 from vg2gt.data.sources.masks import find_masks
-from vg2gt.data.sources.parsing import (
-    check_intrinsics,
-    errors_name,
-    existing_image,
-    named_file,
-    positive,
-    to_world,
-)
+from vg2gt.data.sources.parsing import check_intrinsics, errors_name, existing_image, named_file
 from vg2gt.data.sources.undistortion import posed_image, size_on_disk
 from vg2gt.io import Lens, TransformsFrame, read_transforms
+from vg2gt.io.cameras_json import invert_pose
 from vg2gt.io.colmap import PIXEL_CENTER, Camera, require_pycolmap
 from vg2gt.io.files import by_number
 from vg2gt.io.image_files import Size, image_size
-
-log = logging.getLogger(__name__)
 
 FILE = "transforms.json"
 BLENDER = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
@@ -70,7 +60,7 @@ class Nerfstudio(FileSource):
         **shared: Unpack[HoldoutOptions],
     ) -> None:
         self.has_depth = depth
-        self.depth_scale = positive("depth_scale", depth_scale, "stored units per unit of the poses")
+        self.depth_scale = depth_scale
         super().__init__(root, **shared)
 
     def is_scene(self, folder: Path) -> bool:
@@ -88,31 +78,20 @@ class Nerfstudio(FileSource):
         records, first_test = _records(scene, folder)
         where = f"{transforms_files(folder)[0]} of scene {scene}"
         with errors_name(scene):
-            named = {i: _named_image(folder, record.file_path, where) for i, record in enumerate(records)}
+            named = _named_files(folder, records, "file_path", where)
             color = {i: found for i, path in named.items() if (found := existing_image(path)) is not None}
             depth = _named_files(folder, records, "depth_file_path", where)
             depth = {i: path for i, path in depth.items() if path.is_file()}
-            masks = self._masks(scene, folder, records, color, where)
+            masks = _named_files(folder, records, "mask_path", where)
+        if not masks:
+            masks = find_masks(folder / MASKS, {i: path.name for i, path in color.items()}, f"scene {scene}")
         if not color:
             tried = f"; tried {named[0]} and other endings" if named else ""
             raise DataError(f"scene {scene}: none of the {len(records)} images of {where} exists{tried}")
-        poses = {i: to_world(np.asarray(record.world_to_camera, np.float64)) for i, record in enumerate(records)}
+        poses = {i: invert_pose(np.asarray(record.world_to_camera, np.float64)) for i, record in enumerate(records)}
         posed = {i: _posed(scene, where, records[i].lens, path, masks.get(i)) for i, path in color.items()}
         index = make_index(scene, folder, color, depth if self.has_depth else None, poses, {}, posed=posed)
         return replace(index, extra={**index.extra, "test": np.array(index.frame_ids) >= first_test})
-
-    def _masks(
-        self, scene: str, folder: Path, records: Sequence[TransformsFrame], color: dict[int, Path], where: str
-    ) -> dict[int, Path]:
-        named = {i: path for i, path in _named_files(folder, records, "mask_path", where).items() if i in color}
-        missing = [str(path) for path in named.values() if not path.is_file()]
-        if missing:
-            log.warning(
-                "%s lists masks that do not exist; all pixels of their images are used: %s", where, ", ".join(missing)
-            )
-        found = {i: path for i, path in named.items() if path.is_file()}
-        rest = {i: path.name for i, path in color.items() if i not in named}
-        return found if named else find_masks(folder / MASKS, rest, f"scene {scene}")
 
 
 def transforms_files(folder: Path) -> list[Path]:
@@ -136,12 +115,6 @@ def _records(scene: str, folder: Path) -> tuple[list[TransformsFrame], int]:
 def _named_files(folder: Path, records: Sequence[TransformsFrame], field: str, where: str) -> dict[int, Path]:
     named = {i: getattr(record, field) for i, record in enumerate(records) if getattr(record, field)}
     return {i: named_file(folder, name.replace("\\", "/"), where) for i, name in named.items()}
-
-
-def _named_image(folder: Path, name: str, where: str) -> Path:
-    """Finds a named image; for ``../images/a.png``, left by a file that was moved up, tries ``images/a.png`` first."""
-    inside = folder / re.sub(r"^(\.\./)+", "", name)
-    return inside if name.startswith("../") and existing_image(inside) else named_file(folder, name, where)
 
 
 def _posed(scene: str, where: str, lens: Lens, path: Path, mask: Path | None) -> PosedImage:

@@ -6,13 +6,12 @@ scene.
 
 from __future__ import annotations
 
-import logging
+import glob
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -20,11 +19,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from vg2gt.data.base import DataError
-from vg2gt.io.cameras_json import invert_pose
 from vg2gt.io.errors import FormatError
-from vg2gt.io.files import regular
-
-log = logging.getLogger(__name__)
+from vg2gt.io.files import by_number, regular
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".tif", ".tiff", ".webp", ".bmp")
 
@@ -38,9 +34,9 @@ _NO_SKEW = 1e-3  # tolerance, as a fraction of the focal length: half a pixel at
 _LARGEST = float(np.finfo(np.float32).max)
 
 
-def read_numbers(path: Path, scene: str, skip_lines: int = 0) -> NDArray[np.float64]:
+def read_numbers(path: Path, scene: str) -> NDArray[np.float64]:
     """Reads a table of numbers with at least one row; ``#`` starts a comment."""
-    rows = [line.split("#")[0].split() for line in _read_lines(path, scene)[skip_lines:]]
+    rows = [line.split("#")[0].split() for line in _read_lines(path, scene)]
     try:
         table = np.array([[float(word) for word in row] for row in rows if row], dtype=np.float64)
     except ValueError as error:
@@ -122,7 +118,7 @@ def named_file(folder: Path, name: str, where: str) -> Path:
 
 
 def existing_image(path: Path) -> Path | None:
-    """Finds an image by its path, or one in the same folder with a different suffix or case; None if there is none.
+    """Finds an image by its path, or by its name with another or an additional suffix; None if there is none.
 
     Models and lists often contain file names from before a conversion. If the folder is missing, the least downsampled
     copy of it is used (``images_4`` rather than ``images_8``, as in DL3DV).
@@ -131,20 +127,12 @@ def existing_image(path: Path) -> Path | None:
         return path
     folder = path.parent
     if not folder.is_dir():
-        known = sorted(folder.parent.iterdir()) if folder.parent.is_dir() else []
-        reduced = [each for each in known if re.fullmatch(rf"{re.escape(folder.name)}_\d+", each.name)]
-        largest = min(reduced, key=lambda each: int(each.name.rpartition("_")[2]), default=None)
+        reduced = folder.parent.glob(f"{glob.escape(folder.name)}_[0-9]*")
+        largest = min(reduced, key=lambda each: by_number(each.name), default=None)
         return None if largest is None else existing_image(largest / path.name)
-    files = _images_by_name(path.parent, path.parent.stat().st_mtime_ns)
-    name, stem = path.name.lower(), path.stem.lower()
-    candidates = (name, *(name + suffix for suffix in IMAGE_SUFFIXES), *(stem + suffix for suffix in IMAGE_SUFFIXES))
-    return next((files[candidate] for candidate in candidates if candidate in files), None)
-
-
-@lru_cache(maxsize=16)
-def _images_by_name(folder: Path, state: int) -> dict[str, Path]:
-    """Returns the images of a folder by lower-case name; ``state``, the folder's mtime, is part of the cache key."""
-    return {path.name.lower(): path for path in sorted(folder.iterdir()) if path.suffix.lower() in IMAGE_SUFFIXES}
+    endings = [ending for suffix in IMAGE_SUFFIXES for ending in (suffix, suffix.upper())]
+    candidates = (folder / (stem + ending) for stem in (path.name, path.stem) for ending in endings)
+    return next((candidate for candidate in candidates if candidate.is_file()), None)
 
 
 @contextmanager
@@ -199,12 +187,6 @@ def rigid(poses: NDArray[np.float64], frames: Sequence[int], where: str) -> NDAr
     return exact
 
 
-def to_world(world_to_camera: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Inverts a rigid pose ``[4, 4]``; returns NaN, which drops the frame, if it is not finite."""
-    finite = (np.abs(world_to_camera) < 1e30).all()
-    return invert_pose(world_to_camera) if finite else np.full((4, 4), np.nan)
-
-
 def pinhole(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:
     """Returns intrinsics ``[3, 3]`` from focal lengths and principal point in pixels (integer pixel centres)."""
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
@@ -238,32 +220,9 @@ def four_intrinsics(intrinsics: Sequence[float] | None) -> tuple[float, ...] | N
     """
     if intrinsics is not None and len(intrinsics) != 4:
         raise ValueError(f"intrinsics must be [fx, fy, cx, cy], got {list(intrinsics)}")
-    return tuple(float(value) for value in intrinsics) if intrinsics else None
-
-
-def positive(name: str, value: float, unit: str) -> float:
-    """Checks that an argument of a loader is above 0.
-
-    Raises:
-        ValueError: if it is not; the message names the argument and its unit.
-    """
-    if not value > 0:
-        raise ValueError(f"{name} must be positive ({unit}), got {value}")
-    return float(value)
+    return None if intrinsics is None else tuple(map(float, intrinsics))
 
 
 def expanded(path: str | None) -> Path | None:
     """Returns a path with ``~`` expanded; None for an empty one."""
     return Path(path).expanduser() if path else None
-
-
-def existing_depth_root(path: str | None) -> Path | None:
-    """Returns the separate depth folder of a dataset; None if none is given.
-
-    Raises:
-        FileNotFoundError: if it is given but does not exist.
-    """
-    folder = expanded(path)
-    if folder is not None and not folder.is_dir():
-        raise FileNotFoundError(f"the depth folder {folder} (working directory: {Path.cwd()}) does not exist")
-    return folder

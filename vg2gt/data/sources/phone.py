@@ -13,24 +13,18 @@ unreliable. Principal points are measured from the image corner, as in ARKit.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vg2gt.data.sources.parsing import (
-    CORNER_TO_CENTER,
-    errors_name,
-    numbered,
-    pinhole,
-    pose_matrices,
-)
+from vg2gt.data.sources.parsing import CORNER_TO_CENTER, errors_name, numbered, pinhole, pose_matrices
 from vg2gt.io.errors import FormatError
-from vg2gt.io.image_files import Size, image_size, read_color
+from vg2gt.io.image_files import Size, image_size
 from vg2gt.io.json_checks import load_json
 from vg2gt.io.record3d import is_archive, read_recorded, recorded_files, unpack_lzfse
 from vg2gt.io.video import video_size
@@ -38,7 +32,6 @@ from vg2gt.io.video import video_size
 PACKED = ".depth"
 """Suffix of depth files that store compressed floats in metres."""
 VIDEO = "rgb.mp4"
-RECORD3D, POLYCAM, STRAY = (f"export of {app}" for app in ("Record3D", "Polycam", "Stray Scanner"))
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # from ARKit's camera axes to OpenCV's
 
 
@@ -47,61 +40,33 @@ class Recording:
     """Files and cameras of a recording, by frame number.
 
     Attributes:
-        layout: name of the layout, for messages.
         color: colour image files; for Stray Scanner always the video.
         depth: depth files.
         poses: ``[4, 4]`` camera-to-world, OpenCV, metres.
         intrinsics: ``[3, 3]`` of the colour images, integer pixel centres.
         color_size: ``(height, width)`` of the colour images.
-        recorded: ``(height, width)`` of the depth, if known from the metadata.
+        depth_size: ``(height, width)`` of the depth; None: that of its first file.
     """
 
-    layout: str
     color: Mapping[int, Path]
     depth: Mapping[int, Path]
     poses: Mapping[int, NDArray[np.float64]]
     intrinsics: Mapping[int, NDArray[np.float64]]
     color_size: Size
-    recorded: Size | None = None
-
-    def depth_size(self, scene: str) -> Size:
-        """Returns ``(height, width)`` of the depth: ``recorded``, or that of the first file."""
-        return self.recorded or image_size(next(iter(self.depth.values())), scene)
+    depth_size: Size | None = None
 
 
-def app_of(folder: Path) -> str | None:
-    """Detects the app that exported a folder or archive; None if it is no such export."""
-    if is_archive(folder) or ((folder / "metadata").is_file() and (folder / "rgbd").is_dir()):
-        return RECORD3D
-    if (folder / "keyframes" / "cameras").is_dir():
-        return POLYCAM
-    return STRAY if (folder / "odometry.csv").is_file() and (folder / VIDEO).is_file() else None
+def app_of(folder: Path) -> Callable[[Path, str], Recording] | None:
+    """Returns the reader for the app that exported a folder or archive; None if it is no such export.
 
-
-def read_export(folder: Path, scene: str) -> Recording | None:
-    """Lists the files of an export and reads its cameras; None if the folder is no export of an app.
-
-    Raises:
-        DataError: if it is damaged.
-        ImportError: if a required package is not installed, such as PyAV for videos.
+    The reader takes the folder and the scene's name. It raises ``FormatError`` or ``DataError`` if the export is
+    damaged, and ``ImportError`` if a required package is not installed, such as PyAV for videos.
     """
-    readers = {RECORD3D: _read_record3d, POLYCAM: _read_polycam, STRAY: _read_stray}
-    app = app_of(folder)
-    with errors_name(scene):
-        return readers[app](folder, scene) if app is not None else None
-
-
-def confidence_of(depth: Path) -> Path | None:
-    """Returns the confidence file of a depth image, if there is one."""
-    path = depth.parent.parent / "confidence" / depth.name
-    return path if path.is_file() else None
-
-
-def read_color_file(path: Path, scene: str, size: Size | None) -> NDArray[np.uint8]:
-    """Decodes a colour image ``[H, W, 3]``, which may be in an archive."""
-    with errors_name(scene):
-        content = read_recorded(path) if is_archive(path.parent.parent) else None
-    return read_color(path, scene, size, content)
+    if is_archive(folder) or ((folder / "metadata").is_file() and (folder / "rgbd").is_dir()):
+        return _read_record3d
+    if (folder / "keyframes" / "cameras").is_dir():
+        return _read_polycam
+    return _read_stray if (folder / "odometry.csv").is_file() and (folder / VIDEO).is_file() else None
 
 
 def read_metres(path: Path, scene: str, size: Size) -> NDArray[np.float32]:
@@ -127,30 +92,19 @@ def _unpacked(path: Path, kind: np.dtype[Any], size: Size) -> NDArray[Any]:
 
 
 def _read_record3d(recording: Path, scene: str) -> Recording:
-    """Reads a ``.r3d``; older files lack the depth size, which is then derived from the images' aspect ratio."""
+    """Reads a ``.r3d``: ``poses`` as qx qy qz qw x y z; column-major ``K``, or coefficients per frame."""
     path = recording / "metadata"
     content = load_json(path, read_recorded(path))
     color, depth = recorded_files(recording, ".jpg"), recorded_files(recording, PACKED)
     first = next(iter(color.values()), None)
     size = image_size(first, scene, content=read_recorded(first)) if first else (0, 0)
-    export = _of_metadata(path, content, color, depth, size)
-    if not (color and depth):
-        return export
-    if "dh" in content and "dw" in content:
-        height, width = _numbers(path, content, "dh", "dw").astype(int).tolist()
-    else:
-        pixels = len(unpack_lzfse(next(iter(depth.values())))) / 4
-        height, width = (round((pixels * size[i] / size[1 - i]) ** 0.5) for i in (0, 1))
-    if not 0 < height * width <= size[0] * size[1]:
-        raise FormatError(f"{path}: depth of {width}x{height} pixels with images of {size[1]}x{size[0]}")
-    return replace(export, recorded=(height, width))
-
-
-def _of_metadata(path: Path, content: Any, color: dict[int, Path], depth: dict[int, Path], size: Size) -> Recording:
-    """Parses the metadata: ``poses`` as qx qy qz qw x y z; column-major ``K``, or coefficients per frame."""
     height, width = _numbers(path, content, "h", "w")
-    if color and not np.isclose(height * size[1], width * size[0], rtol=0.02):
-        raise FormatError(f"{path} gives a size of {width:g}x{height:g} pixels, but the images are {size[1]}x{size[0]}")
+    recorded = _numbers(path, content, "dh", "dw").astype(int).tolist()
+    if first and (recorded[0] > size[0] or not np.isclose(height * size[1], width * size[0], rtol=0.02)):
+        raise FormatError(
+            f"{path} gives images of {width:g}x{height:g} pixels and depth of {recorded[1]}x{recorded[0]}, but the "
+            f"images are {size[1]}x{size[0]}"
+        )
     try:
         rows = np.asarray(content["poses"], np.float64).reshape(-1, 7)
         if coefficients := content.get("perFrameIntrinsicCoeffs"):
@@ -161,12 +115,12 @@ def _of_metadata(path: Path, content: Any, color: dict[int, Path], depth: dict[i
         raise FormatError(f"{path}: expected poses and intrinsics as Record3D writes them ({error})") from error
     scale = np.diag([size[1] / width, size[0] / height, 1.0])
     return Recording(
-        RECORD3D,
         color,
         depth,
         poses={i: pose @ _OPENGL for i, pose in enumerate(pose_matrices(rows[:, [4, 5, 6, 0, 1, 2, 3]]))},
         intrinsics={i: scale @ camera - CORNER_TO_CENTER for i, camera in enumerate(cameras)},
         color_size=size,
+        depth_size=(recorded[0], recorded[1]),
     )
 
 
@@ -183,7 +137,7 @@ def _read_polycam(folder: Path, scene: str) -> Recording:
         poses[frame] = np.vstack((rows.reshape(3, 4), [0, 0, 0, 1])) @ _OPENGL
         intrinsics[frame] = pinhole(*_numbers(path, content, "fx", "fy", "cx", "cy")) - CORNER_TO_CENTER
     size = image_size(next(iter(color.values())), scene) if color else (0, 0)
-    return Recording(POLYCAM, color, depth, poses, intrinsics, size)
+    return Recording(color, depth, poses, intrinsics, size)
 
 
 def _read_stray(folder: Path, scene: str) -> Recording:
@@ -198,7 +152,6 @@ def _read_stray(folder: Path, scene: str) -> Recording:
         raise FormatError(f"{path} has no frames, or invalid frame numbers")
     frames = rows[:, 0].astype(int).tolist()
     return Recording(
-        STRAY,
         dict.fromkeys(frames, folder / VIDEO),
         numbered(folder / "depth", scene),
         dict(zip(frames, pose_matrices(rows[:, 1:]), strict=True)),

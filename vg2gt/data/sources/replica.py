@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
 from typing_extensions import Unpack
 
 from vg2gt.data.base import DataError
@@ -30,9 +28,8 @@ class Replica(FileSource):
         shared: see ``FileSource``; a video has 2000 closely spaced frames.
     """
 
-    layout = "SCENE/traj.txt and SCENE/results/{frame,depth}*, there or one folder deeper"
+    layout = "SCENE/traj.txt and SCENE/results/{frame,depth}*, there or up to two folders deeper"
     scene_marks = ("results",)
-    levels = 1
     index_options = ("intrinsics",)
     depth_scale = 6553.5
 
@@ -49,7 +46,14 @@ class Replica(FileSource):
         """Lists the files of a scene and reads its poses."""
         color, depth = (numbered(folder / "results", scene, f"{kind}*") for kind in ("frame", "depth"))
         check_found(scene, folder / "results", {"frame images": color, "depth images": depth})
-        poses = _read_trajectory(folder / "traj.txt", scene, max(color))
+        path, last = folder / "traj.txt", max(color)
+        rows = read_numbers(path, scene)
+        if rows.shape[1] != 16 or len(rows) <= last:
+            raise DataError(
+                f"{path} of scene {scene} must have a line of 16 numbers (4x4 camera-to-world) for each of the frames "
+                f"0 to {last}; it has {rows.shape[0]} lines of {rows.shape[1]}"
+            )
+        poses = dict(enumerate(rows[: last + 1].reshape(-1, 4, 4)))
         size = first_size(color, scene)
         if self.intrinsics is None and size != _SIZE:
             raise DataError(
@@ -58,14 +62,3 @@ class Replica(FileSource):
             )
         intrinsics = pinhole(*(self.intrinsics or (600.0, 600.0, 599.5, 339.5)))
         return make_index(scene, folder, color, depth, poses, intrinsics)
-
-
-def _read_trajectory(path: Path, scene: str, last: int) -> dict[int, NDArray[np.float64]]:
-    """Reads camera-to-world poses by frame number, which is the line number."""
-    rows = read_numbers(path, scene)
-    if rows.shape[1] != 16 or len(rows) <= last:
-        raise DataError(
-            f"{path} of scene {scene} must have a line of 16 numbers (4x4 camera-to-world) for each of the frames 0 to "
-            f"{last}; it has {rows.shape[0]} lines of {rows.shape[1]}"
-        )
-    return dict(enumerate(rows[: last + 1].reshape(-1, 4, 4)))

@@ -8,16 +8,15 @@ The layout is detected from the files present:
   ScanNet);
 * exports of Record3D, Polycam and Stray Scanner: see ``phone``;
 * 7-Scenes: ``frame-NNNNNN.{color.png|jpg,depth.png,pose.txt}`` in one folder, intrinsics in ``camera-intrinsics.txt``.
+  Its raw colour and depth are not registered to each other.
 
 Poses are camera-to-world, OpenCV, in metres; in any unit if depth is not read.
 """
 
 from __future__ import annotations
 
-import logging
 import re
 from collections.abc import Sequence
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -35,34 +34,21 @@ from vg2gt.data.sources.parsing import (
     numbered,
     pinhole,
     pose_matrices,
-    positive,
     read_matrix,
     read_numbers,
     read_poses,
 )
-from vg2gt.data.sources.phone import (
-    PACKED,
-    VIDEO,
-    Recording,
-    app_of,
-    confidence_of,
-    read_color_file,
-    read_export,
-    read_metres,
-)
+from vg2gt.data.sources.phone import PACKED, VIDEO, Recording, app_of, read_metres
 from vg2gt.geometry.cameras import resize_intrinsics
-from vg2gt.io.image_files import Size, check_size, read_depth
-from vg2gt.io.record3d import R3D
+from vg2gt.io.image_files import Size, check_size, read_color, read_depth
+from vg2gt.io.record3d import R3D, is_archive, read_recorded
 from vg2gt.io.video import read_frame
-
-log = logging.getLogger(__name__)
 
 _INTRINSICS_FILES = ("K.txt", "camera-intrinsics.txt")
 _POSE_FILES = ("poses.txt", "pose.txt")
 _POSE_COLUMNS = {16: "4x4 camera-to-world", 12: "3x4", 7: "x y z qx qy qz qw", 8: "time and x y z qx qy qz qw"}
 _COLOR_FOLDERS = ("images", "color", "rgb", "image")
 _POSE_FOLDERS = ("pose", "poses")
-_FEW = 10  # a source with more recordings does not log each of them
 _OFF_CENTRE = 0.15  # maximum offset of the principal point from the centre, as a fraction of width or height
 
 
@@ -104,7 +90,7 @@ class RGBDFolder(FileSource):
     ) -> None:
         self.has_depth = depth
         self.is_metric = depth
-        self.depth_scale = positive("depth_scale", depth_scale, "stored units per metre")
+        self.depth_scale = depth_scale
         self.invalid = tuple(int(value) for value in invalid)
         self.intrinsics = four_intrinsics(intrinsics)
         super().__init__(root, holdout=holdout, **shared)
@@ -131,31 +117,27 @@ class RGBDFolder(FileSource):
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
         """Lists the files of a recording and reads its cameras; frames have the size of the depth images."""
-        found = read_export(folder, scene) or self._read_folder(folder, scene)
+        reader = app_of(folder) or self._read_folder
+        with errors_name(scene):
+            found = reader(folder, scene)
         depth = found.depth if self.has_depth else None
         check_found(scene, folder, {"colour images": found.color, "depth images": [True] if depth is None else depth})
-        size = found.color_size if depth is None else found.depth_size(scene)
+        size = found.color_size if depth is None else found.depth_size or first_size(depth, scene)
         matrices = found.intrinsics
         if self.intrinsics is not None:
             matrices = dict.fromkeys(found.color, pinhole(*self.intrinsics))
         matrices = {frame: _resized(matrix, found.color_size, size) for frame, matrix in matrices.items()}
-        index = make_index(
+        return make_index(
             scene, folder, found.color, depth, found.poses, matrices, found.color_size, size=size, depth_size=size
         )
-        if len(self.scenes) <= _FEW:
-            from_color = f", colour reduced from {found.color_size[1]}x{found.color_size[0]}"
-            _say(
-                f"scene {scene}: {found.layout}, {len(index.frame_ids)} frames of {size[1]}x{size[0]} in {folder}"
-                f"{from_color if found.color_size[0] > size[0] else ''}"
-            )
-        return index
 
     def read_color(self, index: SceneIndex, row: int) -> NDArray[np.uint8]:
         """Decodes a colour image, or a frame of a video."""
         path = index.color[row]
-        if path.name != VIDEO:
-            return read_color_file(path, index.name, index.color_size)
         with errors_name(index.name):
+            if path.name != VIDEO:
+                content = read_recorded(path) if is_archive(path.parent.parent) else None
+                return read_color(path, index.name, index.color_size, content)
             pixels = read_frame(path, index.frame_ids[row])
         check_size(path, index.name, pixels.shape[:2], index.color_size)
         return pixels
@@ -166,8 +148,8 @@ class RGBDFolder(FileSource):
         if path.suffix.lower() == PACKED:
             return read_metres(path, index.name, size)
         depth = super().read_depth(index, row, size)
-        confidence = confidence_of(path)
-        return depth if confidence is None else depth * (read_depth(confidence, index.name, size) > 0)
+        confidence = path.parent.parent / "confidence" / path.name
+        return depth * (read_depth(confidence, index.name, size) > 0) if confidence.is_file() else depth
 
     def _read_folder(self, folder: Path, scene: str) -> Recording:
         """Lists a recording in folders or in the layout of 7-Scenes, and reads its cameras."""
@@ -178,16 +160,10 @@ class RGBDFolder(FileSource):
             pose_file = next((folder / name for name in _POSE_FILES if (folder / name).is_file()), None)
             poses = numbered(pose_folder, scene, suffixes=(".txt",)) if pose_folder else pose_file
             cameras = [*_exported_intrinsics(folder), *_beside(folder)]
-            layout = f"folders {images.name}/ and depth/" if depth else f"images in {images.name}/"
         else:
-            _say(
-                f"scene {scene}: raw 7-Scenes streams are not registered; colour and depth do not match",
-                logging.WARNING,
-            )
             color, depth = (numbered(folder, scene, f"frame-*.{kind}.*") for kind in ("color", "depth"))
             poses = numbered(folder, scene, "frame-*.pose.txt", suffixes=(".txt",))
             cameras = [*_beside(folder), *_beside(folder.parent)]  # in the folder of the frames or of the sequences
-            layout = "7-Scenes layout"
         check_found(scene, folder, {"colour images": color, "depth images": depth if self.has_depth else color})
         color_size = first_size(color, scene)
         depth_size = first_size(depth, scene) if self.has_depth else color_size
@@ -201,7 +177,7 @@ class RGBDFolder(FileSource):
         if self.intrinsics is None:
             known = [path for path in cameras if path.is_file()]
             intrinsics = _read_intrinsics(known, folder, scene, color_size, depth_size)
-        return Recording(layout, color, depth, read, dict.fromkeys(color, intrinsics), color_size, depth_size)
+        return Recording(color, depth, read, dict.fromkeys(color, intrinsics), color_size, depth_size)
 
 
 class ScanNet(RGBDFolder):
@@ -271,12 +247,6 @@ def _resized(matrix: NDArray[np.float64], size: Size, target: Size) -> NDArray[n
     if size == target:
         return matrix
     return resize_intrinsics(torch.from_numpy(matrix), target[1] / size[1], target[0] / size[0]).numpy()
-
-
-@lru_cache
-def _say(message: str, level: int = logging.INFO) -> None:
-    """Logs a message once, even if both training and evaluation read the recording."""
-    log.log(level, message)
 
 
 def _exported_intrinsics(folder: Path) -> list[Path]:

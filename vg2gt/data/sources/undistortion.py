@@ -6,7 +6,6 @@ are undistorted with the same map as colours. A file or camera that does not mat
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -66,13 +65,15 @@ class Undistortion:
         intrinsics = colmap_intrinsics(camera)  # raises if there is no focal length
         target = pinhole_camera(camera)
         size, lens_size = (target.height, target.width), (camera.height, camera.width)
-        if min(size[0] / lens_size[0], size[1] / lens_size[1]) < _SMALLEST:
-            raise ValueError(_senseless(camera))
         intrinsics = colmap_intrinsics(target)
         places = _places(camera, intrinsics, size)
         inside = (places >= -0.5 - _OUTSIDE) & (places <= np.array(lens_size[::-1]) - 0.5 + _OUTSIDE)
-        if not inside.all():  # also if one is NaN
-            raise ValueError(_senseless(camera))
+        too_small = min(size[0] / lens_size[0], size[1] / lens_size[1]) < _SMALLEST
+        if too_small or not inside.all():  # also if one is NaN
+            raise ValueError(
+                f"the distortion of a {camera.model_name} camera ({camera.params_info}: {camera.params_to_string()}) "
+                "maps the image border outside the image; it does not belong to these images"
+            )
         return Undistortion(lens_size, size, intrinsics, places)
 
     def color(self, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -123,43 +124,29 @@ def _places(camera: Camera, intrinsics: NDArray[np.float64], size: Size) -> NDAr
     return fine[0].permute(1, 2, 0).float().contiguous().numpy()
 
 
-def _senseless(camera: Camera) -> str:
-    return (
-        f"the distortion of a {camera.model_name} camera ({camera.params_info}: {camera.params_to_string()}) maps the "
-        "image border outside the image; it does not belong to these images"
-    )
-
-
-def size_on_disk(
-    path: Path, scene: str, expected: Size, where: str, is_stored: Callable[[], bool] | None = None
-) -> tuple[Size, bool]:
+def size_on_disk(path: Path, scene: str, expected: Size, where: str) -> tuple[Size, bool]:
     """Returns an image's ``(height, width)``, and whether it must be rotated upright according to its EXIF data.
 
     The camera may belong to the image as stored or to the upright one. The aspect ratio decides; if both match, the
-    upright one is used unless ``is_stored`` says otherwise.
+    upright one is used.
 
     Args:
         path: the image.
         scene: its scene, for messages.
         expected: ``(height, width)`` of its camera; the image may be resized.
         where: source of the camera, for the message.
-        is_stored: called if both orientations match; returns True if the camera belongs to the image as stored.
 
     Raises:
         DataError: if neither orientation has the camera's aspect ratio.
     """
-    turned = orientation(path, scene)
-    stored = image_size(path, scene)
-    upright = image_size(path, scene, upright=True)
-    if turned != 1 and _has_shape(upright, expected):
-        as_stored = _has_shape(stored, expected) and is_stored is not None and is_stored()
-        return (stored, False) if as_stored else (upright, True)
+    stored, upright = image_size(path, scene), image_size(path, scene, upright=True)
+    if orientation(path, scene) != 1 and _has_shape(upright, expected):
+        return upright, True
     if _has_shape(stored, expected):
         return stored, False
-    exif = f" (EXIF orientation {turned}, upright {upright[1]}x{upright[0]})" if turned != 1 else ""
     raise DataError(
-        f"{path} is {stored[1]}x{stored[0]} pixels{exif}, but its camera in {where} is {expected[1]}x{expected[0]}: "
-        "use the camera's own image or a resized copy with the same aspect ratio"
+        f"{path} is {stored[1]}x{stored[0]} pixels, but its camera in {where} is {expected[1]}x{expected[0]}: use the "
+        "camera's own image or a resized copy with the same aspect ratio"
     )
 
 

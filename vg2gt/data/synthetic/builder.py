@@ -72,21 +72,6 @@ class Builder:
         """Adds a box with edge lengths ``size``, turned about the vertical and tilted about its x axis (rad)."""
         self._add(BOX, center, np.array(size) / 2, material, yaw_rotation(turn) @ _tilt_rotation(tilt))
 
-    def tinted_material(
-        self,
-        color: Vector,
-        kinds: tuple[Pattern, ...],
-        frequency: tuple[float, float],
-        other: Vector | None = None,
-    ) -> int:
-        """Draws a material near ``color`` (linear RGB); its second colour is near ``other`` or a shade of the first."""
-        material = self.new_material(kinds, frequency)
-        first = np.array(color) * self.rng.uniform(0.75, 1.3) * self.rng.uniform(0.9, 1.1, 3)
-        shade = self.rng.uniform(0.5, 0.8) if self.rng.random() < 0.5 else self.rng.uniform(1.25, 1.6)
-        second = first * shade if other is None else np.array(other) * self.rng.uniform(0.8, 1.2)
-        self.materials[material][3:9] = np.clip([*first, *second], 0.02, 1.0).tolist()
-        return material
-
     def cylinder(self, center: Vector, radius: float, height: float, material: int, lying: bool = False) -> None:
         """Adds a cylinder, upright or with its axis along y."""
         own = _tilt_rotation(np.pi / 2) if lying else np.eye(3)

@@ -110,14 +110,6 @@ def _workspace(world: World, samples: int) -> tuple[tuple[NDArray, ...], ...]:
     return hits, seen, shadows, (np.empty(3), np.empty(3), np.empty(3))
 
 
-def draw_sky(rng: np.random.Generator, sun: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Draws a sky ``[SKY_COLUMNS]`` with the sun in unit direction ``sun`` ``[3]``."""
-    blue = rng.uniform((0.08, 0.2, 0.5), (0.2, 0.36, 0.8))
-    haze = rng.uniform((0.5, 0.58, 0.65), (0.75, 0.75, 0.8))
-    clouds = (rng.uniform(0.0, 1.2), rng.uniform(0.5, 1.5), rng.integers(1 << 20))
-    return np.array([*haze, *blue, *sun, rng.uniform(0.1, 0.5), *clouds])
-
-
 @part
 def add_sky(sky, d, angle, color):
     """Adds the linear colour of the sky in unit direction ``d`` to ``color``; ``angle`` is the pixel width (rad)."""

@@ -138,20 +138,15 @@ class SyntheticScenes(SceneSource):
         return self.cache_dir / folder / f"{scene}.npz"
 
     def _read_cache(self, scene: str) -> dict[str, NDArray] | None:
-        """Reads a scene from the cache; None if it is missing or, with a warning, damaged or of another shape."""
+        """Reads a scene from the cache; None if it is missing or, with a warning, damaged."""
         path = self.cache_file(scene)
         if path is None or not path.is_file():
             return None
         try:
-            arrays = read_npz(path, ("images", "depth", "world_to_camera", "intrinsics"))
+            return read_npz(path, ("images", "depth", "world_to_camera", "intrinsics"))
         except (FormatError, KeyError, OSError) as error:
             log.warning("the cached scene %s is damaged (%s) and will be rendered again", path, error)
             return None
-        shape = (self.num_frames, *self.size)
-        if arrays["images"].shape != (*shape, 3) or arrays["depth"].shape != shape:
-            log.warning("the cached scene %s does not have shape %s and will be rendered again", path, shape)
-            return None
-        return arrays
 
     def _write_cache(self, scene: str, arrays: dict[str, NDArray]) -> None:
         path = self.cache_file(scene)

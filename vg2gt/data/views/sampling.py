@@ -167,9 +167,6 @@ def scene_pool(source: SceneSource, scenes: Sequence[str], seed: int = 0) -> Sce
     for scene in scenes:
         grouped[source.part(scene)].append(scene)
     weights = {part: weight for part, weight in source.parts().items() if grouped[part]}
-    if len(weights) < len(grouped):
-        absent = ", ".join(part for part in grouped if part not in weights)
-        log.warning("no training scene of %s is used: the other parts are drawn in proportion to their weights", absent)
     return ScenePool(tuple(tuple(grouped[part]) for part in weights), shares(weights), seed)
 
 
@@ -227,8 +224,6 @@ def usable_scenes(source: SceneSource, sampler: ViewSampler, limit: int | None) 
             "%d of %d training scenes have fewer than %d frames and are not used",
             short, len(scenes), sampler.frames_needed,
         )  # fmt: skip
-    if damaged:
-        log.warning("%d of %d training scenes cannot be read and are not used", damaged, len(scenes))
     return usable
 
 
