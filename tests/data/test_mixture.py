@@ -54,7 +54,7 @@ def test_weights_hold_when_the_number_of_views_varies():
     mixture = _mixture(weights=(0.25, 0.75))
     views = ViewSampler(2, 6, max_images=12)
     sampler = StepSampler(mixture, usable_scenes(mixture, views, None), views, 1)
-    drawn = Counter(mixture.part(view.scene) for step in range(2000) for view in sampler.step(step))
+    drawn = Counter(mixture.part(view.scene) for step in range(1000) for view in sampler.step(step))
     share = drawn["rooms"] / sum(drawn.values())
     assert abs(share - 0.25) < 0.015
 

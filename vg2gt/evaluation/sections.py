@@ -102,7 +102,7 @@ def _heading(settings: Mapping[str, Any]) -> str:
         "model": settings["model"],
         "backbone": f"{settings['backend']['name']}, weights {settings['backend']['weights'][:12]}",
         "data": f"{settings['data']}, {settings['scenes']} scenes, views {settings['index']}",
-        "images": f"{settings['size'][0]}x{settings['size'][1]}, fitted to {settings['fit']}",
+        "images": f"{settings['size'][0]}x{settings['size'][1]}",
         "depth": f"alignment {settings['alignment']}, true depths from {nearest or 0} to {farthest or 'any'}",
         "CV": f"k = {settings['neighbors']}",
         "LPIPS": settings["lpips"],

@@ -114,20 +114,20 @@ def test_reduced_images_have_reduced_intrinsics(tmp_path):
     np.testing.assert_allclose(index.intrinsics[0][0], [full[0, 0] / 2, 0, (full[0, 2] + 0.5) / 2 - 0.5], rtol=1e-6)
 
 
-def test_absent_images_are_counted_and_keep_the_numbers_and_without_any_their_place_is_named(tmp_path):
+def test_absent_images_are_counted_and_keep_the_numbers_and_without_any_their_place_is_named(tmp_path, caplog):
     write(tmp_path, room(3))
     scene = tmp_path / "statue"
     (scene / "images" / "left" / "009.png").unlink()
     (scene / "images").rename(scene / "photos")
     source = COLMAP(str(scene), images="photos")
     assert source.frames("statue") == (0, 2)
-    assert source.scene_index("statue").dropped == {"without a colour image": 1}
+    assert "1 of 3 frames without a colour image are left out" in caplog.text
     expected = r"none of the .* 3 images is in .*statue/images; the first is left/.* or set data\.images to"
     with pytest.raises(DataError, match=expected):
         COLMAP(str(scene)).frames("statue")
 
 
-def test_points_need_three_views_and_the_nearest_wins(tmp_path):
+def test_points_need_three_views_and_the_nearest_wins(tmp_path, caplog):
     write(tmp_path, room(3))
     source = COLMAP(str(tmp_path), depth="points")
     depth = source.load("statue", [0]).depth[0]
@@ -140,7 +140,7 @@ def test_points_need_three_views_and_the_nearest_wins(tmp_path):
     write_colmap(folder, model)
     source = COLMAP(str(tmp_path), depth="points")
     assert tuple(source.frames("statue")) == (1, 2)
-    assert source.scene_index("statue").dropped == {"without a depth file": 1}
+    assert "1 of 3 frames without a depth file are left out" in caplog.text
     with pytest.raises(ValueError, match="depth must be points"):
         COLMAP(str(tmp_path), depth="dense")
 

@@ -24,7 +24,7 @@ from vg2gt.io.image_files import Size, image_size, typical_size
 
 log = logging.getLogger(__name__)
 
-FORMAT = 4
+FORMAT = 5
 """Version of the index files; increment it when their format changes."""
 _SIZES = ("size", "color_size", "depth_size")
 
@@ -45,7 +45,6 @@ class SceneIndex:
         size: ``(height, width)`` of decoded frames.
         color_size: size of the colour files; None: sizes differ, and each is resized to cover ``size`` and cropped.
         depth_size: size of the depth files; None: each has the size of its colour image.
-        dropped: number of frames left out, by reason.
         extra: further arrays per frame; ``sizes [n, 2]``, ``lens``, ``upright`` and ``mask`` are common to all loaders
             (``make_index``).
     """
@@ -60,7 +59,6 @@ class SceneIndex:
     size: Size
     color_size: Size | None
     depth_size: Size | None
-    dropped: Mapping[str, int] = field(default_factory=dict)
     extra: Mapping[str, NDArray] = field(default_factory=dict)
 
     def row(self, frame: int) -> int:
@@ -200,7 +198,6 @@ def make_index(
         size=size,
         color_size=color_size,
         depth_size=depth_size or color_size,
-        dropped=dict(dropped),
         extra=extra,
     )
 
@@ -225,8 +222,7 @@ def _folders_in(folder: Path) -> list[Path]:
 
 def index_to_bytes(index: SceneIndex) -> bytes:
     """Serialises an index as an ``.npz`` file."""
-    facts = {"dropped": dict(index.dropped), "extra": list(index.extra)}
-    facts |= {name: getattr(index, name) for name in _SIZES}
+    facts = {"extra": list(index.extra)} | {name: getattr(index, name) for name in _SIZES}
     buffer = io.BytesIO()
     np.savez_compressed(
         buffer,
@@ -260,7 +256,6 @@ def read_index(path: Path, scene: str, folder: Path) -> SceneIndex | None:
         depth=tuple(folder / name for name in arrays["depth"].tolist()),
         world_to_camera=arrays["world_to_camera"],
         intrinsics=arrays["intrinsics"],
-        dropped=facts["dropped"],
         extra={name: arrays[f"extra_{name}"] for name in facts["extra"]},
         **{name: facts[name] and tuple(facts[name]) for name in _SIZES},
     )
