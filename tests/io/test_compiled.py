@@ -2,6 +2,7 @@
 
 import ast
 import importlib.util
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -53,12 +54,20 @@ def value_with(constant: int, room: Path) -> int:
     return importlib.import_module("made.kernels").limit()
 
 
-def test_a_changed_constant_of_another_file_is_used(room: Path, tmp_path: Path) -> None:
+def test_a_changed_constant_of_another_file_is_used(
+    room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same sources in another folder share the compiled kernels."""
     cache = tmp_path / "cache" / "vg2gt"
     assert (value_with(1, room), value_with(22, room)) == (1, 22)
     assert len(list(cache.iterdir())) == 2
     before = {path: path.stat().st_mtime_ns for path in cache.rglob("*.nbc")}
     assert value_with(1, room) == 1
+    elsewhere = shutil.copytree(room, tmp_path / "elsewhere" / "made")
+    monkeypatch.setattr(compiled, "PACKAGES", tmp_path)
+    monkeypatch.syspath_prepend(str(elsewhere.parent))
+    assert value_with(1, elsewhere) == 1
+    assert sys.modules["made"].__path__[0] == str(elsewhere)
     assert {path: path.stat().st_mtime_ns for path in cache.rglob("*.nbc")} == before, "it was compiled again"
 
 

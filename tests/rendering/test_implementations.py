@@ -81,20 +81,20 @@ def test_the_search_for_the_median_equals_the_reference(options):
     assert_same_render(found, expected, atol=1e-10)
 
 
-@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 2e-6)])
 @pytest.mark.parametrize("opacity", [0.1, 0.3, 0.6])
-def test_the_compiled_search_crosses_gaps(opacity: float, dtype: torch.dtype, tolerance: float) -> None:
+def test_the_compiled_search_crosses_gaps(opacity: float) -> None:
     """A translucent wall, and one forty times as far: between them nothing tells where the median is."""
-    near, cameras = wall(2000, (32, 48))
+    near, cameras = wall(1000, (16, 24))
     far = replace(near, means=40 * near.means, scales=near.scales * torch.tensor([40.0, 40.0, 1.0]))
     both = replace(near, **{name: torch.cat((getattr(near, name), getattr(far, name))) for name in FIELDS})
     both = replace(both, opacities=opacity * both.opacities)
     exact = render(both, cameras, implementation="dense", bisections=60).depth
-    found = render(floats_to(both, dtype), floats_to(cameras, dtype), implementation="cpu").depth
     there = exact > 0
     assert there.float().mean() > 0.6
-    assert torch.equal(found > 0, there)
-    assert ((found - exact).abs() / exact)[there].max() < tolerance
+    for dtype, tolerance in ((torch.float64, 1e-12), (torch.float32, 2e-6)):
+        found = render(floats_to(both, dtype), floats_to(cameras, dtype), implementation="cpu").depth
+        assert torch.equal(found > 0, there)
+        assert ((found - exact).abs() / exact)[there].max() < tolerance
 
 
 def test_float32_depth_is_that_of_float64() -> None:

@@ -17,12 +17,12 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import llvmlite.binding
 import numba
 from numba.core import codegen, event
-from numba.core.caching import FunctionCache
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
 from numba.extending import register_jitable
 
 log = logging.getLogger(__name__)
@@ -53,14 +53,8 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     def compile_later(function: Callable[..., Any]) -> Any:
         """Returns the kernel, compiled at its first call."""
         made: Any = numba.njit(**options)(function)
-        source = Path(function.__code__.co_filename).resolve().relative_to(PACKAGES)
-        folder = _folder(PACKAGES.joinpath(*source.parts[:2]))
-        if folder is not None:
-            chosen, config.CACHE_DIR = config.CACHE_DIR, str(folder)
-            try:
-                made._cache = _Cache(function)
-            finally:
-                config.CACHE_DIR = chosen
+        if _Locator.from_function(function, function.__code__.co_filename) is not None:
+            made._cache = _Cache(function)
         return made
 
     return compile_later
@@ -71,8 +65,39 @@ def kernel_part(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     return register_jitable(no_cfunc_wrapper=True, **options)
 
 
+class _Locator(_CacheLocator):
+    """Puts all kernels of the same sources into one folder, wherever the sources are installed."""
+
+    def __init__(self, folder: Path, source: Path, line: int) -> None:
+        self._folder, self._place = folder, f"{source.parent.name}-{line}"
+
+    def get_cache_path(self) -> str:
+        """Returns the folder."""
+        return str(self._folder)
+
+    def get_source_stamp(self) -> None:
+        """Returns nothing: the name of the folder tells the sources."""
+
+    def get_disambiguator(self) -> str:
+        """Returns what distinguishes functions of the same name in files of the same name."""
+        return self._place
+
+    @classmethod
+    def from_function(cls, py_func: Any, py_file: str) -> _Locator | None:
+        """Returns the locator of a kernel, or None if no folder is writable."""
+        source = Path(py_file).resolve()
+        folder = _folder(PACKAGES.joinpath(*source.relative_to(PACKAGES).parts[:2]))
+        return None if folder is None else cls(folder, source, py_func.__code__.co_firstlineno)
+
+
+class _Implementation(CompileResultCacheImpl):
+    _locator_classes: ClassVar = [_Locator]
+
+
 class _Cache(FunctionCache):
     """numba's cache, but a full disk or a damaged file leads to another compilation instead of an error."""
+
+    _impl_class = _Implementation
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
