@@ -25,9 +25,7 @@ from vg2gt.io.files import regular
 from vg2gt.io.image_files import Size, read_color
 
 _VERSION = 4
-_PNG_COLOR, _JPEG_COLOR = 1, 2
-_RAW_DEPTH, _ZLIB_DEPTH = 0, 1
-_LONGEST_NAME = 1 << 16
+_COLOR_TYPES, _DEPTH_TYPES = (1, 2), (0, 1)  # PNG, JPEG; raw, zlib
 _LARGEST_SIDE = 1 << 14
 _FRAME_HEADER = "<64s4Q"
 
@@ -35,10 +33,8 @@ _FRAME_HEADER = "<64s4Q"
 class ScanNetSens(ScanNet):
     """Scans in ScanNet's raw ``.sens`` files; each file is a scene, and frames are numbered as in an export.
 
-    Frames, depth and intrinsics are those of ``ScanNet``. Images are decoded directly from the file.
-
-    The arguments are those of ``ScanNet``. Without ``index_cache``, every process first reads the headers of all frames
-    of a scan.
+    Arguments, frames, depth and intrinsics are those of ``ScanNet``. Images are decoded directly from the file. Without
+    ``index_cache``, every process first reads the headers of all frames of a scan.
     """
 
     layout = "sceneNNNN_NN.sens, there or up to two folders deeper"
@@ -89,7 +85,7 @@ class ScanNetSens(ScanNet):
         compression, scale = index.extra["depth_coding"].tolist()
         where = f"frame {frame} in {path} of scene {index.name}"
         expected = 2 * size[0] * size[1]
-        if compression == _ZLIB_DEPTH:
+        if compression == 1:
             try:
                 content = zlib.decompressobj().decompress(content, expected + 1)
             except zlib.error as error:
@@ -118,16 +114,11 @@ def _read_header(file: BinaryIO) -> tuple[NDArray[np.float64], Size, Size, NDArr
     if version != _VERSION:
         raise ValueError(f"version {version} of the format, expected {_VERSION}")
     (name_length,) = _unpack(file, "<Q")
-    if name_length > _LONGEST_NAME:
-        raise ValueError(f"a sensor's name of {name_length} bytes")
-    file.seek(name_length, 1)
+    file.seek(min(name_length, 1 << 16), 1)
     matrices = np.array(_unpack(file, "<64f")).reshape(4, 4, 4)
     color_type, depth_type, *sides = _unpack(file, "<2i4I")
-    if color_type not in (_PNG_COLOR, _JPEG_COLOR) or depth_type not in (_RAW_DEPTH, _ZLIB_DEPTH):
-        raise ValueError(
-            f"colour of type {color_type} and depth of type {depth_type}; known are 1 and 2 (PNG, JPEG) for colour, "
-            "0 and 1 (raw, zlib) for depth"
-        )
+    if color_type not in _COLOR_TYPES or depth_type not in _DEPTH_TYPES:
+        raise ValueError(f"colour of type {color_type} and depth of type {depth_type}; known are 1, 2 and 0, 1")
     if not all(0 < side <= _LARGEST_SIDE for side in sides):
         raise ValueError(f"images of {sides[0]}x{sides[1]} and {sides[2]}x{sides[3]} pixels")
     scale, count = _unpack(file, "<fQ")

@@ -2,32 +2,35 @@
 
 from __future__ import annotations
 
+import hashlib
+import io
+import json
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
+from scipy.ndimage import minimum_filter
 from typing_extensions import Unpack
 
-from examples.data_sets.scan_depth import ScanDepth
 from vg2gt.data.base import DataError
 from vg2gt.data.sources.colmap_model import model_folder_of
 from vg2gt.data.sources.files import FileSource, HoldoutOptions
 from vg2gt.data.sources.index import SceneIndex, make_index
-from vg2gt.data.sources.parsing import (
-    errors_name,
-    expanded,
-    four_intrinsics,
-    numbered,
-    pinhole,
-    read_matrix,
-    read_text_lines,
-)
+from vg2gt.data.sources.parsing import errors_name, four_intrinsics, numbered, pinhole, read_matrix, read_text_lines
 from vg2gt.data.sources.undistortion import is_pinhole, posed_image, size_on_disk
 from vg2gt.io import colmap_images, read_colmap
+from vg2gt.io.arrays import load_npz
 from vg2gt.io.colmap import Camera
+from vg2gt.io.files import write_cached
 from vg2gt.io.image_files import Size
 
+_VERSION = 2  # part of the cache key; increment it when the rendered depth changes
+_CHUNK = 1 << 20  # points projected at a time
 _LOG = "_COLMAP_SfM.log"
 
 
@@ -46,7 +49,7 @@ class TanksAndTemples(FileSource):
         root: a scene, a folder of scenes, or a list of these.
         intrinsics: (fx, fy, cx, cy) in pixels of the images, integer pixel centres; null uses the COLMAP model.
         depth: ``scan`` renders depth from ``S.ply`` and caches it in ``depth_cache``; null for no depth.
-        depth_cache: see ``ScanDepth``.
+        depth_cache: folder of the rendered images.
         shared: see ``FileSource``.
     """
 
@@ -59,14 +62,14 @@ class TanksAndTemples(FileSource):
         root: str | Sequence[str] | None,
         intrinsics: Sequence[float] | None = None,
         depth: str | None = "scan",
-        depth_cache: str | None = None,
+        depth_cache: str = "~/.cache/vg2gt",
         **shared: Unpack[HoldoutOptions],
     ) -> None:
         if depth not in (None, "scan"):
             raise ValueError(f"depth must be scan or null (none), got {depth!r}")
         self.intrinsics = four_intrinsics(intrinsics)
         self.has_depth = depth is not None
-        self._scan_depth = ScanDepth(expanded(depth_cache))
+        self.depth_cache = Path(depth_cache).expanduser()
         super().__init__(root, **shared)
 
     def is_scene(self, folder: Path) -> bool:
@@ -103,9 +106,21 @@ class TanksAndTemples(FileSource):
         return make_index(scene, folder, color, depth, to_world, intrinsics)
 
     def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
-        """Renders depth from the scan."""
-        pose, matrix = index.world_to_camera[row], index.intrinsics[row]
-        return self._scan_depth.read(index.depth[row], index.name, pose, matrix, size)
+        """Renders depth from the scan, or reads it from the cache."""
+        scan, pose, matrix = index.depth[row], index.world_to_camera[row], index.intrinsics[row]
+        with errors_name(index.name):
+            state = scan.stat()
+        file = (str(scan.resolve()), state.st_mtime_ns, state.st_size)
+        key = json.dumps([_VERSION, file, (pose.tolist(), matrix.tolist(), size)])
+        stored = self.depth_cache / "scan-depth" / f"{hashlib.sha256(key.encode()).hexdigest()[:24]}.npz"
+        if stored.is_file():
+            with suppress(DataError):  # damaged: render again
+                return load_npz(stored, index.name, ("depth",))["depth"]
+        depth = render_points(read_points(scan, index.name), pose, matrix, size)
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, depth=depth)
+        write_cached(stored, buffer.getvalue(), self.depth_cache)
+        return depth
 
     def _intrinsics(self, scene: str, folder: Path, color: Mapping[int, Path]) -> dict[int, NDArray[np.float64]]:
         if self.intrinsics is not None:
@@ -147,21 +162,12 @@ def moved(similarity: NDArray[np.float64], pose: NDArray[np.float64]) -> NDArray
 
 def _read_log(path: Path, scene: str) -> list[NDArray[np.float64] | None]:
     """Reads, for each image, a line of three integers and a 4x4 camera-to-world matrix; None if the second is -1."""
-    rows = [line.split() for line in read_text_lines(path, scene)]
-    if not rows or len(rows) % 5:
-        raise DataError(f"{path} of scene {scene} has {len(rows)} lines; expected five for each image")
-    poses: list[NDArray[np.float64] | None] = []
-    for start in range(0, len(rows), 5):
-        header, matrix = rows[start], rows[start + 1 : start + 5]
-        try:
-            numbers = [int(word) for word in header]
-            values = np.array([[float(word) for word in row] for row in matrix])
-        except ValueError as error:
-            raise DataError(f"{path} of scene {scene}, image {start // 5}: {error}") from error
-        if len(numbers) != 3 or values.shape != (4, 4):
-            raise DataError(f"{path} of scene {scene}, image {start // 5}: expected 3 numbers and a 4x4 matrix")
-        poses.append(None if numbers[1] < 0 else values)
-    return poses
+    lines = read_text_lines(path, scene)
+    try:
+        values = np.array(" ".join(lines).split(), np.float64).reshape(-1, 3 + 16)
+    except ValueError as error:
+        raise DataError(f"{path} of scene {scene}: expected 3 numbers and a 4x4 matrix for each image") from error
+    return [None if row[1] < 0 else row[3:].reshape(4, 4) for row in values]
 
 
 def _read_similarity(path: Path, scene: str) -> NDArray[np.float64]:
@@ -177,3 +183,51 @@ def _read_similarity(path: Path, scene: str) -> NDArray[np.float64]:
 
 def _log_file(folder: Path) -> Path | None:
     return next(iter(sorted(folder.glob(f"*{_LOG}"))), None) if folder.is_dir() else None
+
+
+@lru_cache(maxsize=1)  # scans are large, and scenes are read in sequence
+def read_points(path: Path, scene: str) -> NDArray[np.float32]:
+    """Reads the finite vertex positions ``[N, 3]`` of a PLY file.
+
+    Raises:
+        DataError: if the file is missing or damaged, or has no points.
+    """
+    try:
+        with np.errstate(over="ignore", invalid="ignore"):
+            scan: Any = trimesh.load(path, file_type="ply", process=False)
+            points = np.asarray(scan.vertices).astype(np.float32)
+    except Exception as error:  # damaged files raise various errors
+        raise DataError(f"cannot read the scan {path} of scene {scene}: {error}") from error
+    points = points[np.isfinite(points).all(1)]
+    if not len(points):
+        raise DataError(f"the scan {path} of scene {scene} has no points")
+    return points
+
+
+def render_points(
+    points: NDArray[np.float32],
+    world_to_camera: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+    size: Size,
+    occlusion: float = 1.03,
+    window: int = 7,
+) -> NDArray[np.float32]:
+    """Renders the depth ``[H, W]`` of points ``[N, 3]``: the nearest one per pixel unless occluded, 0 without a point.
+
+    Every point covers only the pixel it projects to, so that depth comes from a point less than 0.71 pixels away. A
+    point is occluded if its depth exceeds ``occlusion`` times the smallest depth in the window of ``window`` pixels (an
+    odd number, more than the gaps between the points of a near surface) around it.
+    """
+    height, width = size
+    nearest = np.full(height * width, np.inf, np.float32)
+    for part in np.array_split(points, len(points) // _CHUNK + 1):
+        local = part @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
+        local = local[local[:, 2] > 1e-6]
+        z = local[:, 2]
+        x, y = ((local / z[:, None]) @ intrinsics[:2].T + 0.5).T
+        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        pixel = y[inside].astype(np.int64) * width + x[inside].astype(np.int64)
+        np.minimum.at(nearest, pixel, z[inside].astype(np.float32))
+    nearest = nearest.reshape(height, width)
+    front = minimum_filter(nearest, window, mode="nearest")
+    return np.where(np.isfinite(nearest) & (nearest <= front * np.float32(occlusion)), nearest, np.float32(0))

@@ -14,16 +14,8 @@ from typing_extensions import Unpack
 
 from vg2gt.data.base import DataError
 from vg2gt.data.sources.files import FileOptions, FileSource
-from vg2gt.data.sources.index import SceneIndex, make_index
-from vg2gt.data.sources.parsing import (
-    four_intrinsics,
-    named_file,
-    pinhole,
-    positive,
-    read_matrix,
-    read_numbers,
-    read_text_lines,
-)
+from vg2gt.data.sources.index import SceneIndex, check_found, make_index
+from vg2gt.data.sources.parsing import four_intrinsics, named_file, pinhole, positive, read_numbers, read_text_lines
 
 INTRINSICS = {
     "freiburg1": (517.3, 516.5, 318.6, 255.3),
@@ -46,14 +38,12 @@ class TUM(FileSource):
     unknown. Listed files that do not exist are left out and counted.
 
     By default, intrinsics are those of the Kinect in the folder's name (``freiburg1``, ``fr1``, ...). Images are
-    treated as those of a pinhole camera. Images of freiburg3 are undistorted. Those of freiburg1 and freiburg2 are not:
-    with the published coefficients, half of their pixels are off by more than 5 pixels, a tenth by more than 8, and the
-    corners by 15 to 37. Undistort them beforehand if that matters.
+    treated as those of a pinhole camera. Those of freiburg1 and freiburg2 are distorted: half of their pixels are off
+    by more than 5 pixels, and the corners by 15 to 37. Undistort them beforehand if that matters.
 
     Args:
         root: a sequence, a folder of sequences, or a list of these.
-        intrinsics: (fx, fy, cx, cy) in pixels of the colour images; None reads ``K.txt`` next to the lists, or else
-            uses the folder's name.
+        intrinsics: (fx, fy, cx, cy) in pixels of the colour images; None uses the folder's name.
         max_difference: maximum time difference within a frame, in seconds.
         holdout: hold out every N-th frame as an evaluation target; None for none.
         shared: see ``FileSource``; the camera records 30 frames per second.
@@ -93,11 +83,7 @@ class TUM(FileSource):
         color = {i: file for i, file in enumerate(files) if os.path.isfile(file)}
         depth_paths = {i: depth_files[j] for i, j in depth.items()}
         depth_paths = {i: path for i, path in depth_paths.items() if os.path.isfile(path)}
-        if not color or not depth_paths:
-            raise DataError(
-                f"scene {scene} in {folder} has no {'colour' if not color else 'depth'} images: none of those listed "
-                f"in {'rgb' if not color else 'depth'}.txt exists or belongs to a frame"
-            )
+        check_found(scene, folder, {"existing images of rgb.txt": color, "existing images of depth.txt": depth_paths})
         intrinsics = pinhole(*self._camera(scene, folder))
         return make_index(scene, folder, color, depth_paths, {i: poses[j] for i, j in pose.items()}, intrinsics)
 
@@ -105,13 +91,10 @@ class TUM(FileSource):
         named = _CAMERA.search(scene)
         if self.intrinsics is not None:
             return self.intrinsics
-        if (folder / "K.txt").is_file():
-            matrix = read_matrix(folder / "K.txt", scene, ((3, 3),))
-            return matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
         if named is None:
             raise DataError(
                 f"the intrinsics of scene {scene} in {folder} are not known: its name says neither freiburg1 nor "
-                "freiburg2 nor freiburg3; add K.txt (3x3), or set data.intrinsics=[fx,fy,cx,cy]"
+                "freiburg2 nor freiburg3; set data.intrinsics=[fx,fy,cx,cy]"
             )
         return INTRINSICS[f"freiburg{named[1]}"]
 
@@ -138,18 +121,15 @@ def _read_list(path: Path, scene: str) -> tuple[NDArray[np.float64], list[Path]]
     """Increasing times and their files, whose paths are relative to the list."""
     entries: dict[float, str] = {}
     for line in read_text_lines(path, scene):
-        words = line.split(maxsplit=1)
-        time = _number(words[0])
-        if len(words) < 2 or not np.isfinite(time):
-            raise DataError(f"{path} of scene {scene} must have lines of 'timestamp path', not {line!r}")
-        if time in entries:
-            raise DataError(f"{path} of scene {scene} lists {words[0]} twice")
-        entries[time] = words[1]
-    if not entries:
-        raise DataError(f"{path} of scene {scene} lists no file")
-    times = sorted(entries)
-    where = f"{path} of scene {scene}"
-    return np.array(times), [named_file(path.parent, entries[time], where) for time in times]
+        try:
+            time, name = line.split(maxsplit=1)
+            entries[float(time)] = name
+        except ValueError as error:
+            raise DataError(f"{path} of scene {scene} must have lines of 'timestamp path', not {line!r}") from error
+    times = np.array(sorted(entries))
+    if not len(times) or not np.isfinite(times).all():
+        raise DataError(f"{path} of scene {scene} must have lines of 'timestamp path' with finite times")
+    return times, [named_file(path.parent, entries[time], f"{path} of scene {scene}") for time in times.tolist()]
 
 
 def _read_poses(path: Path, scene: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -167,10 +147,3 @@ def _read_poses(path: Path, scene: str) -> tuple[NDArray[np.float64], NDArray[np
     poses[good, :3, :3] = Rotation.from_quat(rows[good, 4:]).as_matrix()
     poses[good, :3, 3] = rows[good, 1:4]
     return rows[:, 0], poses
-
-
-def _number(word: str) -> float:
-    try:
-        return float(word)
-    except ValueError:
-        return np.nan

@@ -1,16 +1,13 @@
-"""DTU as MVSNet trains and tests on it."""
+"""DTU as MVSNet tests on it."""
 
 from pathlib import Path
 
 import numpy as np
 
-from examples.data_sets.dtu import DTU, DTUTraining
+from examples.data_sets.dtu import DTU
 from vg2gt.data import Frames
 
-from .layouts import SIZE, Layout, pixels, save
-
-CROP = (4, 7)
-"""Rows and columns of the halved recorded image that are cut away above and to the left; 44 and 80 in DTU."""
+from .layouts import Layout, pixels, save
 
 
 def pfm(depth: np.ndarray) -> bytes:
@@ -27,27 +24,12 @@ def camera(world_to_camera: np.ndarray, intrinsics: np.ndarray) -> str:
     return "extrinsic\n" + "\n".join(rows[:4]) + "\n\nintrinsic\n" + "\n".join(rows[4:]) + "\n\n425.0 2.5\n"
 
 
-def write_depth(folder: Path, frames: Frames, crop: tuple[int, int] | None = None) -> None:
-    """``depth_map`` and ``depth_visual``; with crop: of twice the size, around the images. Masked depth is nonsense."""
+def write_depth(folder: Path, frames: Frames) -> None:
+    """``depth_map`` and ``depth_visual``; masked depth is nonsense."""
     folder.mkdir(parents=True)
     for i, depth in enumerate(frames.depth.numpy() * 1000):
-        if crop:
-            depth = np.pad(depth, ((crop[0],) * 2, (crop[1],) * 2), constant_values=700).repeat(2, 0).repeat(2, 1)
         (folder / f"depth_map_{i:04d}.pfm").write_bytes(pfm(np.where(depth > 0, depth, 777)))
         save(folder / f"depth_visual_{i:04d}.png", np.where(depth > 0, 255, 10).astype(np.uint8))
-
-
-def write_training(root: Path, frames: Frames) -> None:
-    """Scan 1 in light 3, with cameras of a quarter of the size and depth of the recorded size."""
-    (root / "Cameras" / "train").mkdir(parents=True)
-    for i, image in enumerate(pixels(frames)):
-        save(root / "Rectified" / "scan1_train" / f"rect_{i + 1:03d}_3_r5000.png", image)
-        intrinsics = frames.intrinsics[i].double().numpy().copy()
-        intrinsics[:2, 2] += 0.25
-        intrinsics[:2] /= 4
-        text = camera(frames.world_to_camera[i].double().numpy(), intrinsics)
-        (root / "Cameras" / "train" / f"{i:08d}_cam.txt").write_text(text)
-    write_depth(root / "Depths_raw" / "scan1", frames, CROP)
 
 
 def write_test(root: Path, frames: Frames) -> None:
@@ -62,14 +44,11 @@ def write_test(root: Path, frames: Frames) -> None:
     write_depth(root / "depth" / "scan65", frames)
 
 
-assert SIZE[0] % 4 != 0, "a quarter of the size must not be mistaken for another"
-
 # Depth is stored in float32 millimetres.
 LAYOUTS = {
-    "dtu_training": Layout(write_training, DTUTraining, depth_quantum=lambda depth: depth * 1e-6),
     "dtu": Layout(
         write_test,
-        lambda root: DTU(f"{root}/scans", depth="pfm", depth_root=f"{root}/depth"),
+        lambda root: DTU(f"{root}/scans", depth_root=f"{root}/depth"),
         image_error=0.012,
         depth_quantum=lambda depth: depth * 1e-6,
     ),

@@ -1,4 +1,4 @@
-"""ScanNet: exported, and the raw stream; iPhone frames of ScanNet++, among DSLR images."""
+"""ScanNet: exported, and the raw stream."""
 
 import struct
 import zlib
@@ -8,12 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from examples.data_sets.scannet_sens import ScanNetSens
-from examples.data_sets.scannetpp import ScanNetPPiPhone
 from vg2gt.data import Frames
 from vg2gt.data.sources import ScanNet
 
 from .layout_rgbd import write_pose_files
-from .layouts import Layout, camera_to_world, encoded, millimetres, pixels, save
+from .layouts import Layout, camera_to_world, encoded, millimetres, pixels
 
 JPEG_ERROR = 0.009
 """Mean absolute error of images of the test's room as JPEG of quality 95 (measured: 0.0060 to 0.0077)."""
@@ -57,29 +56,8 @@ def write_sens(root: Path, frames: Frames, jpeg: bool = True, packed: bool = Tru
     return path
 
 
-def write_scannetpp(root: Path, frames: Frames) -> None:
-    """Frames 0, 10, 20, ...; the cameras' file names them from the last to the first, and one more."""
-    folder = root / "processed" / "0a5c013435"
-    names = [f"frame_{10 * i:06d}" for i in range(len(frames.images))]
-    for name, image, depth in zip(names, pixels(frames), millimetres(frames), strict=True):
-        save(folder / "images" / f"{name}.jpg", image)
-        save(folder / "depth" / f"{name}.png", depth)
-    save(folder / "images" / "DSC00010.jpg", np.zeros((20, 30, 3), np.uint8))
-    save(folder / "depth" / "DSC00010.png", np.zeros((20, 30), np.uint16))
-    intrinsics = frames.intrinsics.double().numpy()
-    intrinsics[:, :2, 2] += 0.5
-    poses = camera_to_world(frames)
-    np.savez(
-        folder / "scene_iphone_metadata.npz",
-        images=["frame_999990.jpg", *(f"{name}.jpg" for name in names[::-1])],
-        trajectories=[poses[0], *poses[::-1]],
-        intrinsics=[intrinsics[0], *intrinsics[::-1]],
-    )
-
-
 LAYOUTS = {
     "scannet": Layout(write_export, ScanNet, image_error=JPEG_ERROR, frame_ids=range(8, 14)),
     "scannet_sens": Layout(write_sens, ScanNetSens, image_error=JPEG_ERROR),
     "scannet_sens_plain": Layout(partial(write_sens, jpeg=False, packed=False), ScanNetSens),
-    "scannetpp_iphone": Layout(write_scannetpp, ScanNetPPiPhone, image_error=JPEG_ERROR, frame_ids=range(0, 60, 10)),
 }

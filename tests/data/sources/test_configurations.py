@@ -34,14 +34,6 @@ def _scannet_sens(root: Path, first: str, second: str) -> None:
     _lists(f"{root}/scannetv2_", first, second)
 
 
-def _scannetpp(root: Path, *scenes: str) -> None:
-    for scene in scenes:
-        layout_scannet.write_scannetpp(root, room())
-        (root / "processed" / "0a5c013435").rename(root / scene)
-    (root / "splits").mkdir()
-    _lists(f"{root}/splits/nvs_sem_", *scenes)
-
-
 def _replica(root: Path, *scenes: str) -> None:
     for scene in scenes:
         layout_replica.write(root, room(), scene)
@@ -63,7 +55,6 @@ SMALL = ["data.image_size=[28,42]", "data.min_views=2", "data.max_views=2", "dat
         ("infinigen", _infinigen, ["a"], ["a"], []),
         ("scannet", _scannet, ["scene0000_00"], ["scene0001_00"], [EVERY]),
         ("scannet_sens", _scannet_sens, ["scene0707_00"], ["scene0708_00"], [EVERY]),
-        ("scannetpp", _scannetpp, ["scene1"], ["scene2"], []),
         (
             "replica",
             _replica,

@@ -1,4 +1,4 @@
-"""DTU: the real scan by plane sweep, registration of the training set, what is refused."""
+"""DTU: the real scan by plane sweep, masked depth."""
 
 from dataclasses import replace
 
@@ -7,11 +7,10 @@ import pytest
 import torch
 from PIL import Image
 
-from examples.data_sets.dtu import DTU, EVALUATION_SCANS, DTUTraining, _of_images, _registered
-from vg2gt.data import DataError
+from examples.data_sets.dtu import DTU
 from vg2gt.data.transforms import resize
 
-from .layout_dtu import write_training
+from .layout_dtu import LAYOUTS, write_test
 from .layouts import SIZE, room, save
 from .plane_sweep import median_best_ncc
 
@@ -34,39 +33,16 @@ def test_real_scan_by_plane_sweep(shared):
     assert score(inverted, 1) < 0.7
 
 
-def test_training_cameras_of_both_sizes_give_the_same_intrinsics():
-    """Of the recorded image c: halved and cropped by (80, 44) for the images, a quarter of that for the depth maps."""
-    full = np.array([[2892.33, 0, 823.205], [0, 2883.18, 619.07], [0, 0, 1]])
-    quarter = full.copy()
-    quarter[:2] *= 0.5
-    quarter[:2, 2] -= (80, 44)
-    quarter[:2] /= 4
-    images = _of_images(quarter, (512, 640), reduced=True)
-    np.testing.assert_allclose(images, _of_images(full, (512, 640), reduced=False))
-    np.testing.assert_allclose(images[0], [1446.165, 0, 823.205 / 2 - 80 - 0.25])
-
-
-def test_depth_of_a_quarter_stands_at_every_fourth_pixel():
-    quarter = np.arange(20, dtype=np.float32).reshape(4, 5) + 1
-    depth = _registered(quarter, (16, 20), None, "scan1")  # pyright: ignore[reportArgumentType]
-    assert np.array_equal(depth[::4, ::4], quarter)
-    assert depth[0, :12].tolist() == [1, 1, 2, 2, 2, 2, 3, 3, 3, 3, 4, 4]
-
-
-def test_scans_masked_depth_and_what_is_missing(tmp_path):
-    write_training(tmp_path, room(3))
-    (tmp_path / "Rectified" / f"scan{EVALUATION_SCANS[0]}_train").mkdir()
-    assert DTUTraining(str(tmp_path), keep_evaluation_scans=True).scenes == ("scan1", "scan24")
-    folder = tmp_path / "Depths_raw" / "scan1"
+def test_depth_is_masked_and_frames_without_it_are_left_out(tmp_path):
+    write_test(tmp_path, room(3))
+    folder = tmp_path / "depth" / "scan65"
     with Image.open(folder / "depth_visual_0000.png") as image:
         mask = np.array(image)
     mask[: mask.shape[0] // 2] = 10  # not brighter than the threshold
     save(folder / "depth_visual_0000.png", mask)
     (folder / "depth_map_0001.pfm").unlink()
-    source = DTUTraining(str(tmp_path))
-    assert (source.scenes, tuple(source.frames("scan1"))) == (("scan1",), (0, 2))
-    depth = source.load("scan1", [0]).depth[0]
+    source = LAYOUTS["dtu"].read(tmp_path)
+    assert tuple(source.frames("scan65")) == (0, 2)
+    depth = source.load("scan65", [0]).depth[0]
     assert not depth[: SIZE[0] // 2].any()
     assert depth[SIZE[0] // 2 :].any()
-    with pytest.raises(DataError, match=r"no images rect_\*_5_r5000.png"):
-        DTUTraining(str(tmp_path), light=5).frames("scan1")
