@@ -24,13 +24,8 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 INFINIGEN, BLENDER = "infinigen==1.15.5", "bpy==4.2.0"
 # Infinigen's name of a kind of room, and prefix of the names of its floors.
-KINDS = {
-    "DiningRoom": "dining-room",
-    "LivingRoom": "living-room",
-    "Bedroom": "bedroom",
-    "Kitchen": "kitchen",
-    "Bathroom": "bathroom",
-}
+KINDS = {"DiningRoom": "dining-room", "LivingRoom": "living-room"}
+KINDS |= {"Bedroom": "bedroom", "Kitchen": "kitchen", "Bathroom": "bathroom"}
 HELD_OUT = (3, 7, 10, 14, 16, 24, 28, 30, 32, 36)
 """Seeds excluded from training: two rooms of each kind among the first forty."""
 _THREADS = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "MKL", "OPENBLAS", "NUMBA")}

@@ -39,32 +39,15 @@ class SweepTraining(lightning.LightningModule):
     from before the decay can resume with more ``steps``, as if they had been configured from the start.
 
     Args:
-        steps: total number of steps.
-        rate: learning rate of AdamW.
-        weight_decay: weight decay of matrices and convolution kernels.
-        warmup: steps of linear warm-up.
-        cooldown: fraction of the steps over which the learning rate decays.
-        average: decay of the exponential moving average.
-        token_noise: standard deviation of the noise added to the tokens in every second step, which makes the decoded
-            depth change smoothly with the tokens.
+        options: ``training`` in ``train.yaml``.
     """
 
-    def __init__(
-        self,
-        steps: int,
-        rate: float,
-        weight_decay: float,
-        warmup: int,
-        cooldown: float,
-        average: float,
-        token_noise: float,
-    ) -> None:
+    def __init__(self, options: DictConfig) -> None:
         super().__init__()
-        self.steps, self.rate, self.weight_decay = steps, rate, weight_decay
-        self.warmup, self.cooldown, self.token_noise = warmup, cooldown, token_noise
+        self.options = options
         self.net = SweepNet()
         self.net.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
-        self.averaged = AveragedModel(self.net, multi_avg_fn=get_ema_multi_avg_fn(average))
+        self.averaged = AveragedModel(self.net, multi_avg_fn=get_ema_multi_avg_fn(options.average))
         self.averaged.requires_grad_(False)
 
     def training_step(self, sample: Sample, index: int) -> Tensor:
@@ -73,8 +56,8 @@ class SweepTraining(lightning.LightningModule):
         views = PosedViews(images, sample.world_to_camera, sample.intrinsics, sample.scenes)
         encoding = self.net.encode(self.net.features(images), views, sample.depth_range, sample.sources, sample.planes)
         taps = encoding.taps
-        if self.token_noise and self.global_step % 2:
-            taps = tuple(tap + self.token_noise * torch.randn_like(tap) for tap in taps)
+        if self.options.token_noise and self.global_step % 2:
+            taps = tuple(tap + self.options.token_noise * torch.randn_like(tap) for tap in taps)
         depth, log_scale = self.net.decode(taps, encoding.context, encoding.context_fine, encoding.swept)
         with full_precision(depth):
             loss, terms = objective(encoding, depth, log_scale, sample)
@@ -96,15 +79,16 @@ class SweepTraining(lightning.LightningModule):
         """Returns AdamW and the learning-rate schedule of the class docstring."""
         decayed = [p for p in self.net.parameters() if p.dim() > 1]
         rest = [p for p in self.net.parameters() if p.dim() <= 1]
-        groups = [{"params": decayed, "weight_decay": self.weight_decay}, {"params": rest, "weight_decay": 0.0}]
-        optimizer = torch.optim.AdamW(groups, lr=self.rate, betas=(0.9, 0.98), fused=True)
+        groups = [{"params": decayed, "weight_decay": self.options.weight_decay}, {"params": rest, "weight_decay": 0.0}]
+        optimizer = torch.optim.AdamW(groups, lr=self.options.rate, betas=(0.9, 0.98), fused=True)
         scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, self._relative_rate)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
     def _relative_rate(self, step: int) -> float:
-        begin = (1 - self.cooldown) * self.steps
-        fall = min(max((step - begin) / max(self.steps - begin, 1), 0.0), 1.0)
-        return min(1.0, (step + 1) / self.warmup) * (0.02 + 0.98 * (0.5 + 0.5 * math.cos(math.pi * fall)))
+        steps = self.options.steps
+        begin = (1 - self.options.cooldown) * steps
+        fall = min(max((step - begin) / max(steps - begin, 1), 0.0), 1.0)
+        return min(1.0, (step + 1) / self.options.warmup) * (0.02 + 0.98 * (0.5 + 0.5 * math.cos(math.pi * fall)))
 
 
 def write_weights(training: SweepTraining, path: Path, config: DictConfig, rooms: int) -> None:
@@ -136,18 +120,18 @@ def main(config: DictConfig) -> None:
     out = Path(config.out)
     newest = max(out.glob("*.ckpt"), key=lambda path: path.stat().st_mtime, default=None)
     checkpoint = newest if config.resume == "auto" else config.resume
-    training = SweepTraining(**config.training)
+    training = SweepTraining(config.training)
     first = torch.load(checkpoint, "cpu", weights_only=True, mmap=True)["global_step"] if checkpoint else 0
     files = scene_files(**config.scenes)
     rooms = read_infinigen(config.infinigen.folder, config.scenes.folder) if config.infinigen.folder else []
-    count = training.steps * config.processes
+    count = config.training.steps * config.processes
     every = TrainingSamples(files, count, config.seed, rooms, config.infinigen.share, **config.samples)
     samples = Subset(every, range(first * config.processes, len(every)))
     if config.begin and not checkpoint:
         for net in (training.net, training.averaged.module):
             net.load_state_dict(load_file(config.begin))
     if checkpoint:
-        print(f"resuming {checkpoint} at step {first} of {training.steps}", flush=True)
+        print(f"resuming {checkpoint} at step {first} of {config.training.steps}", flush=True)
     keep = ModelCheckpoint(
         out, "step-{step:06d}", every_n_train_steps=config.save_every, save_top_k=-1, auto_insert_metric_name=False
     )
@@ -156,7 +140,7 @@ def main(config: DictConfig) -> None:
         devices=config.processes,
         strategy="auto" if config.processes == 1 else DDPStrategy(gradient_as_bucket_view=True),
         precision="bf16-mixed",
-        max_steps=training.steps,
+        max_steps=config.training.steps,
         callbacks=[keep, RichProgressBar()],
         logger=CSVLogger(out, name="", version=""),
         log_every_n_steps=50,

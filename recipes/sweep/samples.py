@@ -250,7 +250,7 @@ def recolour(images: Tensor, rng: Generator) -> Tensor:
         images = images + torch.from_numpy(rng.normal(0, 0.015, (views, 1, 1, 1))).float()
     if rng.random() < 0.35:
         deviation = rng.uniform(0.4, 1.1)
-        blurred = gaussian_blur2d(images, 5, (deviation, deviation))
+        blurred = gaussian_blur2d(images, 5, (deviation, deviation), separable=False)
         chosen = torch.from_numpy(rng.random(views) < rng.uniform(0.3, 1.0))
         images = torch.where(chosen[:, None, None, None], blurred, images)
     if rng.random() < 0.7:
