@@ -132,8 +132,14 @@ def score(scene: Scene, folder: Path, numbers: Sequence[int], chosen: Sequence[i
 def run(folder: Path, ready: LoadedModel, window: int, held: Sequence[int]) -> None:
     """Reconstructs the walk in windows; keeps intermediate results in ``FOLDER/windows``, so that it can resume."""
     clock, begin = Clock(), time.process_time()
-    places = {"window_folder": folder / "windows", "renderer": ready.renderer, "monitor": clock}
-    scene = reconstruct_with(ready.model, folder / "walk", window=window, **places)
+    scene = reconstruct_with(
+        ready.model,
+        folder / "walk",
+        window=window,
+        window_folder=folder / "windows",
+        renderer=ready.renderer,
+        monitor=clock,
+    )
     total = time.process_time() - begin
     scores = score(scene, folder, held, held)
     halves = {name: (times[: len(times) // 2], times[-(len(times) // 2) :]) for name, times in clock.steps.items()}

@@ -19,6 +19,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
@@ -172,7 +173,7 @@ class Rooms:
         if figures["ok"]:
             link_paths(place / room)
 
-    def _stage(self, command: list[object], log: Path) -> None:
+    def _stage(self, command: Sequence[object], log: Path) -> None:
         """Runs a script of this folder in Infinigen's environment."""
         script, *options = map(str, command)
         with log.open("w") as file:
