@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from vg2gt.io.files import write_json
+from vg2gt.profiling import now
 from vg2gt.studies.study import compose_run
 from vg2gt.training.loop import Run, build
 from vg2gt.training.schedule import parameter_groups
@@ -25,23 +26,10 @@ RESULTS = Path(__file__).resolve().parent / "results"
 MEGABYTE = 1e6
 
 
-def parser(
-    doc: str | None, *, out: Path = RESULTS, device: bool = False, threads: int | None = None
-) -> argparse.ArgumentParser:
-    """Returns a parser with the options that the benchmarks share.
-
-    Args:
-        doc: docstring of the script.
-        out: default of ``--out``, the folder of results.
-        device: whether to add ``--device``, which defaults to the GPU if there is one.
-        threads: default of ``--threads``; None adds no such option.
-    """
+def parser(doc: str | None, out: Path = RESULTS) -> argparse.ArgumentParser:
+    """Returns a parser with the docstring of a script as help and ``--out``, the folder of results."""
     made = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     made.add_argument("--out", type=Path, default=out)
-    if device:
-        made.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    if threads is not None:
-        made.add_argument("--threads", type=int, default=threads)
     return made
 
 
@@ -57,30 +45,18 @@ def write_results(folder: Path, name: str, content: Mapping[str, Any]) -> Path:
     return path
 
 
-def machine(device: torch.device | str = "cpu") -> dict[str, Any]:
-    """Returns processor, cores and versions, and the name of the GPU if ``device`` is one."""
-    name = platform.processor() or platform.machine()
-    info = Path("/proc/cpuinfo")
-    if info.exists():
-        models = [line.split(":")[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")]
-        name = models[0] if models else name
-    found = {
-        "processor": name,
-        "cores": os.cpu_count(),
-        "torch": torch.__version__,
-        "python": platform.python_version(),
-    }
-    if torch.device(device).type == "cuda":
-        found["gpu"] = torch.cuda.get_device_name(device)
-    return found
+def machine() -> dict[str, Any]:
+    """Returns processor, cores and versions, and the name of the GPU if torch can use one."""
+    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
+    models = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
+    found = {"processor": models[0] if models else platform.processor(), "cores": os.cpu_count()}
+    found |= {"torch": torch.__version__, "python": platform.python_version()}
+    return found | ({"gpu": torch.cuda.get_device_name()} if torch.cuda.is_available() else {})
 
 
 def used_seconds(device: torch.device) -> float:
     """Returns CPU time of all cores, which other processes hardly affect; on a GPU, wall time after synchronising."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-        return time.perf_counter()
-    return time.process_time()
+    return now(device) if device.type == "cuda" else time.process_time()
 
 
 def prepare(

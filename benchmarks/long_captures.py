@@ -1,41 +1,45 @@
 """Long captures: ``python benchmarks/long_captures.py make|run|alone FOLDER``.
 
 ``make`` renders a walk through a corridor of furnished rooms as an RGB-D recording, and holds out every twentieth
-frame. It can resume. ``run`` reconstructs the walk in windows, and measures peak memory, CPU time of every window, and
-PSNR on the held-out frames. ``alone`` reconstructs some rooms, each at once from its own frames, and compares PSNR on
-the same held-out frames; it needs the result of ``run``. Each prints JSON.
+frame. ``run`` reconstructs the walk in windows, and measures peak memory, CPU time of every window, and PSNR on the
+held-out frames. ``alone`` reconstructs some rooms, each at once from its own frames, and compares PSNR on the same
+held-out frames; it needs the result of ``run``. Each prints JSON.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import sys
+import statistics
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image
 
-from examples.write_recordings import stored_depth
+from examples.write_recordings import write_recording
+from vg2gt.data import Frames
 from vg2gt.data.sources.rgbd import RGBDFolder
 from vg2gt.data.synthetic.builder import Builder
 from vg2gt.data.synthetic.furniture import MAKERS
 from vg2gt.data.synthetic.renderer import World
 from vg2gt.data.synthetic.synthetic_scene import SyntheticScene, level_poses
+from vg2gt.data.transforms import from_bytes
+from vg2gt.io.files import read_json, write_json
 from vg2gt.metrics import psnr
 from vg2gt.reconstruction.monitor import Monitor
 from vg2gt.reconstruction.pipeline import reconstruct_with
 from vg2gt.reconstruction.scene import Scene, render_views
-from vg2gt.runs.load import load_model
+from vg2gt.runs.load import LoadedModel, load_model
 
 LENGTH, WIDTH, HEIGHT = 4.0, 5.0, 2.6  # metres of a room
 DOOR, LINTEL = 1.3, 2.1
 HELD_OUT = 20  # hold out every 20th frame
+SIZE = (64, 96)  # height and width
+CHOSEN = (3, 10, 16)  # rooms that are reconstructed alone
 
 
 class Corridor(SyntheticScene):
@@ -79,22 +83,17 @@ class Corridor(SyntheticScene):
         super().__init__(world, level_poses(place, 1.3 * np.sin(2 * np.pi * s), -0.15 + 0.1 * np.sin(4 * s)), 1.3, size)
 
 
-def make(folder: Path, rooms: int, frames: int, size: tuple[int, int]) -> None:
-    """Renders missing frames of the recording; ``held`` has the held-out frames, ``walk`` all others."""
-    scene = Corridor(rooms, frames, size)
-    kept = {"held": [i for i in range(frames) if i % HELD_OUT == HELD_OUT // 2]}
-    kept["walk"] = sorted(set(range(frames)) - set(kept["held"]))
-    for name, numbers in kept.items():
-        for kind in ("images", "depth"):
-            (folder / name / kind).mkdir(parents=True, exist_ok=True)
-        np.savetxt(folder / name / "poses.txt", np.linalg.inv(scene.world_to_camera[numbers]).reshape(-1, 16))
-        np.savetxt(folder / name / "K.txt", scene.intrinsics)
-        for number in numbers:
-            path = folder / name / "depth" / f"{number:05d}.png"
-            if not path.is_file():
-                (frame,) = scene.render([number], 1)
-                Image.fromarray(frame.image).save(folder / name / "images" / f"{number:05d}.png")
-                Image.fromarray(stored_depth(frame.depth)).save(path)
+def make(folder: Path, scene: SyntheticScene, parts: dict[str, list[int]]) -> None:
+    """Writes a recording of the frames of each part, unless it exists."""
+    for name, numbers in parts.items():
+        if (folder / name).exists():
+            continue
+        frames = scene.render(numbers, 1)
+        images = from_bytes(torch.from_numpy(np.stack([frame.image for frame in frames]))).permute(0, 3, 1, 2)
+        poses = torch.from_numpy(scene.world_to_camera[numbers])
+        intrinsics = torch.from_numpy(scene.intrinsics).expand(len(numbers), 3, 3)
+        depth = torch.from_numpy(np.stack([frame.depth for frame in frames]))
+        write_recording(folder / name, Frames(images, depth, poses, intrinsics))
 
 
 class Clock(Monitor):
@@ -114,32 +113,25 @@ class Clock(Monitor):
             now = time.process_time()
             self.steps.setdefault(name, []).append(now - before)
             before = now
-            print(f"{name} {len(self.steps[name])} of {total}", file=sys.stderr, flush=True)
 
         yield advance
 
 
-def score(scene: Scene, folder: Path, numbers: set[int] | None = None) -> dict[int, float]:
-    """Returns the PSNR of held-out frames by number; the scene must be in the recording's world frame."""
+def score(scene: Scene, folder: Path, numbers: Sequence[int], chosen: Sequence[int]) -> dict[int, float]:
+    """Returns the PSNR of the chosen held-out frames by number; the scene must be in the recording's world frame."""
     source = RGBDFolder(str(folder / "held"), holdout=None)
     (name,) = source.scenes
-    index, camera = source.scene_index(name), replace(scene.named_cameras()[0], photo=None)
-    found = {}
-    for row, frame in enumerate(index.frame_ids):
-        number = int(index.color[row].stem)
-        if numbers is not None and number not in numbers:
-            continue
-        loaded = source.load_whole(name, frame)
-        camera = replace(camera, world_to_camera=index.world_to_camera[row])
-        (view,) = render_views(scene.renderer, scene.gaussians, [camera])
-        found[number] = float(psnr(view.color[None], loaded.images[:1])[0])
-    return found
+    rows = [row for row, number in enumerate(numbers) if number in chosen]
+    frames, camera = source.load(name, rows), replace(scene.named_cameras()[0], photo=None)
+    cameras = [replace(camera, world_to_camera=pose.double().numpy()) for pose in frames.world_to_camera]
+    views = render_views(scene.renderer, scene.gaussians, cameras)
+    found = [float(psnr(view.color[None], image[None])[0]) for view, image in zip(views, frames.images, strict=True)]
+    return {numbers[row]: round(value, 3) for row, value in zip(rows, found, strict=True)}
 
 
-def run(folder: Path, window: int, overrides: list[str]) -> None:
+def run(folder: Path, ready: LoadedModel, window: int, held: Sequence[int]) -> None:
     """Reconstructs the walk in windows; keeps intermediate results in ``FOLDER/windows``, so that it can resume."""
-    ready, clock = load_model(overrides=overrides, device="cpu"), Clock()
-    begin = time.process_time()
+    clock, begin = Clock(), time.process_time()
     scene = reconstruct_with(
         ready.model,
         folder / "walk",
@@ -149,59 +141,56 @@ def run(folder: Path, window: int, overrides: list[str]) -> None:
         monitor=clock,
     )
     total = time.process_time() - begin
-    scores = score(scene, folder)
+    scores = score(scene, folder, held, held)
+    halves = {name: (times[: len(times) // 2], times[-(len(times) // 2) :]) for name, times in clock.steps.items()}
     found = {
         "views": len(scene.names),
         "gaussians": len(scene.gaussians),
         "peak_mib": round(clock.peak_memory_mib),
         "core_seconds": round(total, 1),
         "seconds": {name: round(sum(times), 1) for name, times in clock.steps.items()},
-        "second_half_over_first": {
-            name: round(sum(times[-(len(times) // 2) :]) / sum(times[: len(times) // 2]), 3)
-            for name, times in clock.steps.items()
-            if len(times) > 9
-        },
-        "psnr": round(float(np.mean(list(scores.values()))), 3),
-        "scores": {str(number): round(value, 3) for number, value in scores.items()},
+        "second_half_over_first": {n: round(sum(b) / sum(a), 3) for n, (a, b) in halves.items() if len(a) > 4},
+        "psnr": round(statistics.mean(scores.values()), 3),
     }
-    (folder / "run.json").write_text(json.dumps(found))
-    print(json.dumps({name: value for name, value in found.items() if name != "scores"}))
+    print(json.dumps(found))
+    write_json(folder / "run.json", found | {"scores": scores})
 
 
-def alone(folder: Path, rooms: int, frames: int, chosen: list[int], overrides: list[str]) -> None:
+def alone(folder: Path, ready: LoadedModel, rooms: int, parts: dict[str, list[int]]) -> None:
     """Reconstructs some rooms, each from its own frames; compares PSNR on held-out frames with that of ``run``."""
-    ready = load_model(overrides=overrides, device="cpu")
-    whole = {int(number): value for number, value in json.loads((folder / "run.json").read_text())["scores"].items()}
+    whole = read_json(folder / "run.json")["scores"]
     files = sorted((folder / "walk" / "images").iterdir())
-    for room in chosen:
+    frames = len(parts["walk"]) + len(parts["held"])
+    for room in (room for room in CHOSEN if room < rooms):
         inside = range(frames * room // rooms, frames * (room + 1) // rooms)
-        scene = reconstruct_with(
-            ready.model, [path for path in files if int(path.stem) in inside], window=0, renderer=ready.renderer
-        )
-        scores = score(scene, folder, set(inside))
-        ours = np.mean([whole[number] for number in scores])
-        theirs = np.mean(list(scores.values()))
-        print(json.dumps({"room": room, "alone": round(float(theirs), 3), "walk": round(float(ours), 3)}))
+        photos = [path for path, number in zip(files, parts["walk"], strict=True) if number in inside]
+        scene = reconstruct_with(ready.model, photos, window=0, renderer=ready.renderer)
+        scores = score(scene, folder, parts["held"], inside)
+        walk = statistics.mean(whole[str(number)] for number in scores)
+        print(json.dumps({"room": room, "alone": round(statistics.mean(scores.values()), 3), "walk": round(walk, 3)}))
 
 
 def main() -> None:
-    """Runs the command line."""
+    """Runs the command line; other words are overrides of the model."""
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     arguments.add_argument("what", choices=("make", "run", "alone"))
     arguments.add_argument("folder", type=Path)
     arguments.add_argument("--rooms", type=int, default=20)
     arguments.add_argument("--frames", type=int, default=1000)
-    arguments.add_argument("--size", type=int, nargs=2, default=(64, 96))
     arguments.add_argument("--window", type=int, default=24)
-    arguments.add_argument("--chosen", type=int, nargs="*", default=[3, 10, 16])
     options, overrides = arguments.parse_known_args()
     torch.manual_seed(0)
+    numbers = range(options.frames)
+    parts = {"held": list(numbers[HELD_OUT // 2 :: HELD_OUT])}
+    parts["walk"] = [number for number in numbers if number % HELD_OUT != HELD_OUT // 2]
     if options.what == "make":
-        make(options.folder, options.rooms, options.frames, tuple(options.size))
-    elif options.what == "run":
-        run(options.folder, options.window, overrides)
+        make(options.folder, Corridor(options.rooms, options.frames, SIZE), parts)
+        return
+    ready = load_model(overrides=overrides, device="cpu")
+    if options.what == "run":
+        run(options.folder, ready, options.window, parts["held"])
     else:
-        alone(options.folder, options.rooms, options.frames, options.chosen, overrides)
+        alone(options.folder, ready, options.rooms, parts)
 
 
 if __name__ == "__main__":

@@ -41,7 +41,6 @@ class PhotoSet:
     """Photographs with cameras at the working size.
 
     Attributes:
-        name: name of the set.
         folder: COLMAP scene of the input views.
         images: all views ``[V, 3, H, W]`` in [0, 1].
         cameras: cameras of all views ``[1, V]``, in the scene's frame.
@@ -50,18 +49,12 @@ class PhotoSet:
         points: number of sparse points in ``folder``.
     """
 
-    name: str
     folder: Path
     images: Tensor
     cameras: Cameras
     context: tuple[int, ...]
     held_out: tuple[int, ...]
     points: int
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Height and width in pixels."""
-        return self.cameras.size
 
     @property
     def given(self) -> list[str]:
@@ -74,11 +67,10 @@ def view_name(index: int) -> str:
     return f"{index:06d}"
 
 
-def prepare(name: str, photos: Path, out: Path, size: int, patch: int, poses: str) -> PhotoSet:
+def prepare(photos: Path, out: Path, size: int, patch: int, poses: str) -> PhotoSet:
     """Estimates the cameras of a folder of photographs once, and writes the input views.
 
     Args:
-        name: name of the set.
         photos: folder of photographs.
         out: output folder; cameras go to ``sfm/``, views to ``SIZE/``.
         size: longer side in pixels.
@@ -111,7 +103,7 @@ def prepare(name: str, photos: Path, out: Path, size: int, patch: int, poses: st
     cameras = views.hints.cameras.select(torch.tensor(context))
     written = _scene(model, titles, [names[index] for index in context], cameras, context)
     write_colmap(folder / "sparse" / "0", written)
-    return PhotoSet(name, folder, views.images, views.hints.cameras, context, held_out, written.num_points3D())
+    return PhotoSet(folder, views.images, views.hints.cameras, context, held_out, written.num_points3D())
 
 
 def _scene(

@@ -12,7 +12,6 @@ rows are kept. Writes JSON and a table to ``benchmarks/results``, and a picture 
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -28,10 +27,10 @@ from photo_sets import PhotoSet, prepare
 from torch import Tensor
 
 from vg2gt.config import compose
-from vg2gt.evaluation.tables import METRICS, columns, markdown_table, number
+from vg2gt.evaluation.tables import METRICS, Metric, columns, markdown_table, number
 from vg2gt.geometry.alignment import align_cameras
 from vg2gt.io import read_gaussian_ply
-from vg2gt.io.files import write_text
+from vg2gt.io.files import read_json, write_text
 from vg2gt.io.images import grid, write_png
 from vg2gt.metrics import LPIPS, WeightsNotFoundError, load_lpips, psnr, ssim
 from vg2gt.reconstruction.pipeline import reconstruct_with
@@ -56,7 +55,7 @@ class Scores:
     Attributes:
         photos: the set.
         lpips: LPIPS metric; None if its weights are missing.
-        panels: renderings of some held-out views for the picture, by label.
+        panels: some held-out views for the picture by label: the photographs, then the scored scenes.
     """
 
     photos: PhotoSet
@@ -85,10 +84,9 @@ class Scores:
             rendered, truth = torch.stack(shown), photos.images[list(views)]
             row[f"psnr{suffix}"] = float(psnr(rendered, truth).mean())
             row[f"ssim{suffix}"] = float(ssim(rendered, truth).mean())
-            if self.lpips is not None and not suffix:
-                row["lpips"] = float(self.lpips(rendered, truth).mean())
-            if not suffix:
-                self.panels[label] = [rendered[views.index(view)] for view in self._pictured()]
+        if self.lpips is not None:
+            row["lpips"] = float(self.lpips(rendered, truth).mean())
+        self.panels[label] = [rendered[views.index(view)] for view in self._pictured()]
         return row
 
     def _pictured(self) -> list[int]:
@@ -96,16 +94,12 @@ class Scores:
         count = min(PICTURED, len(held_out))
         return [held_out[i * (len(held_out) - 1) // max(count - 1, 1)] for i in range(count)]
 
-    def write_picture(self, path: Path) -> Path:
-        """Writes one row per pictured held-out view: the photograph, then the scored scenes in order."""
-        return write_png(path, grid(list(zip(*self.panels.values(), strict=True))))
-
 
 def given_cameras(scene: Scene, photos: PhotoSet) -> Cameras:
     """Returns the scene's cameras in the order of the input views, with intrinsics for the scored image size."""
     order = torch.tensor([scene.names.index(name) for name in photos.given])
     intrinsics = photos.cameras.intrinsics[:, list(photos.context)].to(scene.cameras.intrinsics)
-    return Cameras(scene.cameras.world_to_camera[:, order], intrinsics, photos.size)
+    return Cameras(scene.cameras.world_to_camera[:, order], intrinsics, photos.cameras.size)
 
 
 def ours(
@@ -123,17 +117,17 @@ def ours(
     photos = scores.photos
     restart_peak_memory()
     began = time.process_time()
-    scene = reconstruct_with(loaded.model, photos.folder, size=size or photos.size, renderer=loaded.renderer)
+    scene = reconstruct_with(loaded.model, photos.folder, size=size or photos.cameras.size, renderer=loaded.renderer)
     taken = time.process_time() - began
 
     def scored(label: str, scene: Scene, seconds: float, steps: int) -> Row:
-        used = {"core_seconds": seconds, "peak_memory_mb": peak_memory() / MEGABYTE, "steps": steps}
+        used = {"core_seconds": seconds, "peak_memory_mb": peak_memory(), "steps": steps}
         return {**used, **scores(label, scene.gaussians, given_cameras(scene, photos), scene.renderer)}
 
     rows = [{"budget": FEED_FORWARD, **scored(FEED_FORWARD, scene, taken, 0)}]
     for budget in budgets:
         if budget <= taken:
-            print(f"{photos.name}: budget {budget:g} skipped, {taken:.0f} core-seconds passed before refinement")
+            print(f"{photos.folder}: budget {budget:g} skipped, {taken:.0f} core-seconds passed before refinement")
             continue
         restart_peak_memory()
         began = time.process_time()
@@ -150,13 +144,13 @@ def restart_peak_memory() -> None:
     Path("/proc/self/clear_refs").write_text("5")
 
 
-def peak_memory() -> int:
-    """Returns the largest resident memory of this process in bytes."""
+def peak_memory() -> float:
+    """Returns the largest resident memory of this process in MB."""
     lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmHWM:"))
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:")) * 1024 / MEGABYTE
 
 
-def peer(binary: Path, scores: Scores, extra: Sequence[str], budgets: Sequence[float]) -> list[Row]:
+def peer(binary: Path, scores: Scores, budgets: Sequence[float]) -> list[Row]:
     """Trains and scores OpenSplat's scenes, rendered in the same way (agrees with its own images to 53 dB).
 
     Raises:
@@ -169,19 +163,18 @@ def peer(binary: Path, scores: Scores, extra: Sequence[str], budgets: Sequence[f
     cameras = photos.cameras.select(torch.tensor(photos.context))
     for budget in sorted(budgets):
         target = photos.folder.parent / f"{PEER}-{photos.folder.name}-{budget:g}" / "splat.ply"
-        run = train(binary, photos.folder, target, budget, extra, pace)
+        run = train(binary, photos.folder, target, budget, pace)
         pace = run.core_seconds / run.steps
-        used = {"core_seconds": run.core_seconds, "peak_memory_mb": run.peak_memory / MEGABYTE, "steps": run.steps}
-        scene = replace(read_gaussian_ply(run.scene), background=torch.tensor([BACKGROUND]))
-        found = scores(f"{PEER}, {_budget(budget)}", scene, cameras, renderer)
-        rows.append({"budget": budget, **used, **found})
+        scene = replace(read_gaussian_ply(target), background=torch.tensor([BACKGROUND]))
+        row = {"budget": budget, "core_seconds": run.core_seconds, "peak_memory_mb": run.peak_memory / MEGABYTE}
+        rows.append({**row, "steps": run.steps, **scores(f"{PEER}, {_budget(budget)}", scene, cameras, renderer)})
     return rows
 
 
 def warm_up(loaded: LoadedModel, photos: PhotoSet, refinement: RefineOptions) -> None:
     """Runs once on two small views, so that one-time compilation and loading are not measured."""
     patch = loaded.model.backend.patch_size
-    size = (max(2, photos.size[0] // patch // 4) * patch, max(2, photos.size[1] // patch // 4) * patch)
+    size = (max(2, photos.cameras.size[0] // patch // 4) * patch, max(2, photos.cameras.size[1] // patch // 4) * patch)
     scene = reconstruct_with(loaded.model, photos.folder, size=size, max_images=2, renderer=loaded.renderer)
     refine_scene(scene, replace(refinement, steps=2, seconds=None))
 
@@ -189,7 +182,7 @@ def warm_up(loaded: LoadedModel, photos: PhotoSet, refinement: RefineOptions) ->
 def merged(folder: Path, rows: Sequence[Row]) -> list[Row]:
     """Returns the rows of the newest file, with ``rows`` added or replacing rows with the same key."""
     newest = max(folder.glob("*-photos.json"), default=None)
-    old = [] if newest is None else json.loads(newest.read_text())["rows"]
+    old = [] if newest is None else read_json(newest)["rows"]
     by_key = {tuple(row[name] for name in KEY): row for row in [*old, *rows]}
     return sorted(by_key.values(), key=_order)
 
@@ -205,26 +198,22 @@ def tables(rows: Sequence[Row]) -> str:
     for size in sorted({row["size"] for row in rows}):
         some = [row for row in rows if row["size"] == size]
         budgets = list(dict.fromkeys(row["budget"] for row in sorted(some, key=lambda row: _order(row)[-1])))
-        lines: dict[tuple[str, ...], dict[Any, Row]] = {}
+        lines: dict[tuple[str, ...], dict[Any, str]] = {}
         for row in some:
-            lines.setdefault((row["set"], row["program"], row["settings"]), {})[row["budget"]] = row
-        cells = [[*key, *(_short(of.get(budget)) for budget in budgets)] for key, of in lines.items()]
+            lines.setdefault((row["set"], row["program"], row["settings"]), {})[row["budget"]] = _short(row)
+        cells = [[*key, *(of.get(budget, "") for budget in budgets)] for key, of in lines.items()]
         head = ("set", "program", "settings", *map(_budget, budgets))
         parts += [f"## Longer side {size}", markdown_table(head, cells, 3)]
     shown = columns("psnr", "ssim", "lpips", "gaussians", decimals={"psnr": 2})
-    shown |= {
-        f"{name}_given": replace(METRICS[name], label=f"{METRICS[name].label}, given") for name in ("psnr", "ssim")
-    }
-    head = (*KEY, *(metric.label for metric in shown.values()), "steps", "core-s", "MB")
+    for name in ("psnr", "ssim"):
+        shown[f"{name}_given"] = replace(METRICS[name], label=f"{METRICS[name].label}, given")
+    shown |= {"steps": Metric("steps", 0), "core_seconds": Metric("core-s", 0), "peak_memory_mb": Metric("MB", 0)}
     cells = [
-        [
-            *(str(row[name]) for name in KEY[:-1]),
-            _budget(row["budget"]),
-            *(number(row.get(name), m.decimals) for name, m in shown.items()),
-        ]
-        + [number(row[name], 0) for name in ("steps", "core_seconds", "peak_memory_mb")]
+        [str(row[name]) for name in KEY[:-1]]
+        + [_budget(row["budget"]), *(number(row.get(name), metric.decimals) for name, metric in shown.items())]
         for row in rows
     ]
+    head = (*KEY, *(metric.label for metric in shown.values()))
     return "\n\n".join([*parts, "## All figures", markdown_table(head, cells, len(KEY))]) + "\n"
 
 
@@ -232,13 +221,13 @@ def _budget(budget: float | str) -> str:
     return budget if isinstance(budget, str) else f"{budget:g} s"
 
 
-def _short(row: Row | None) -> str:
-    return "" if row is None else f"{row['psnr']:.2f} {row['ssim']:.3f}"
+def _short(row: Row) -> str:
+    return f"{row['psnr']:.2f} {row['ssim']:.3f}"
 
 
 def arguments() -> argparse.Namespace:
     """Parses the command line."""
-    options = parser(__doc__, threads=1)
+    options = parser(__doc__)
     options.add_argument("folders", nargs="+", metavar="FOLDER", help="folder of photographs, or NAME=FOLDER")
     options.add_argument("--size", type=int, default=280, help="longer side in pixels")
     options.add_argument("--working-size", type=int, help="longer side that VG²GT works at; scored at --size")
@@ -248,64 +237,49 @@ def arguments() -> argparse.Namespace:
     options.add_argument("--model", nargs="+", default=[], metavar="KEY=VALUE", help="overrides of configs/model")
     options.add_argument("--refine", nargs="+", default=[], metavar="KEY=VALUE", help="overrides of configs/refine")
     options.add_argument("--opensplat", type=Path, metavar="BINARY", help="also train OpenSplat")
-    options.add_argument("--peer", nargs="+", default=[], metavar="KEY=VALUE", help="options of OpenSplat")
     options.add_argument("--only-peer", action="store_true", help="skip VG²GT")
-    options.add_argument(
-        "--work", type=Path, default=Path("outputs/photos"), help="folder for cameras, views and pictures"
-    )
+    options.add_argument("--work", type=Path, default=Path("outputs/photos"), help="folder of cameras, views, pictures")
     return options.parse_args()
 
 
 def main() -> None:
     """Measures every set; prints and writes after each."""
     given = arguments()
-    torch.set_num_threads(given.threads)
+    torch.set_num_threads(1)
     changes = [f"refine.{change}" for change in given.refine]
     refinement: RefineOptions = instantiate(compose(None, "+refine=photographs", *changes).refine)
-    loaded = load_model(given.ckpt, overrides=[_of_model(change) for change in given.model], device="cpu")
-    lpips = lpips_or_none()
+    # a leading plus adds a key that the checkpoint's configuration lacks
+    of_model = ["+" * change.startswith("+") + f"model.{change.removeprefix('+')}" for change in given.model]
+    loaded = load_model(given.ckpt, overrides=of_model, device="cpu")
+    size = [f"working-size={given.working_size}"] if given.working_size else []
+    settings = " ".join(sorted([*size, *of_model, *changes])) or "default"
+    try:
+        lpips = load_lpips()
+    except WeightsNotFoundError:
+        lpips = None
     for item in given.folders:
         name, _, folder = item.rpartition("=")
         folder = Path(folder)
         name = name or folder.resolve().name
-        photos = prepare(name, folder, given.work / name, given.size, loaded.model.backend.patch_size, given.poses)
+        photos = prepare(folder, given.work / name, given.size, loaded.model.backend.patch_size, given.poses)
         scores = Scores(photos, lpips)
         common = {"set": name, "size": given.size, "views": [len(photos.context), len(photos.held_out)]}
         common |= {"poses": given.poses, "date": date.today().isoformat(), "machine": machine()}
         rows: list[Row] = []
         if not given.only_peer:
             warm_up(loaded, photos, refinement)
-            size = [f"working-size={given.working_size}"] if given.working_size else []
-            settings = _settings([*size, *map(_of_model, given.model), *changes])
             found = ours(loaded, scores, refinement, given.budgets, given.working_size)
             rows += [{**common, "program": OURS, "settings": settings, **row} for row in found]
         if given.opensplat:
-            found = peer(given.opensplat, scores, [f"--{change}" for change in given.peer], given.budgets)
-            rows += [{**common, "program": PEER, "settings": _settings(given.peer), **row} for row in found]
+            found = peer(given.opensplat, scores, given.budgets)
+            rows += [{**common, "program": PEER, "settings": "default", **row} for row in found]
         for row in rows:
             spent = f"{row['core_seconds']:.0f} core-seconds, {row['gaussians']} Gaussians"
             print(f"{name}, {row['program']}, {_budget(row['budget'])}: {_short(row)}, {spent}", flush=True)
-        print(scores.write_picture(given.work / f"{name}-{given.size}.png"))
+        print(write_png(given.work / f"{name}-{given.size}.png", grid(list(zip(*scores.panels.values(), strict=True)))))
         rows = merged(given.out, rows)
-        path = write_results(given.out, "photos", {"threads": given.threads, "rows": rows})
+        path = write_results(given.out, "photos", {"threads": 1, "rows": rows})
         write_text(path.with_suffix(".md"), tables(rows))
-
-
-def lpips_or_none() -> LPIPS | None:
-    """Returns LPIPS, or None if its weights are missing."""
-    try:
-        return load_lpips()
-    except WeightsNotFoundError:
-        return None
-
-
-def _of_model(change: str) -> str:
-    """Override for a ``--model`` change; a leading plus adds a key that the checkpoint's configuration lacks."""
-    return ("+" if change.startswith("+") else "") + f"model.{change.removeprefix('+')}"
-
-
-def _settings(changes: Sequence[str]) -> str:
-    return " ".join(sorted(changes)) or "default"
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""Speed, and on a GPU memory, of the renderer's implementations: ``python benchmarks/render.py [--device cuda]``.
+"""Speed of the renderer's implementations on a CPU: ``python benchmarks/render.py``; ``gpu.py`` measures a GPU.
 
 Measures all implementations alternately in one process and compares them by ratio. Times are the best of several
-passes: core-milliseconds on a CPU (with one thread unless the table says otherwise), milliseconds on a GPU. Prints
-tables and writes a dated JSON file to ``benchmarks/results``.
+passes, in core-milliseconds (with one thread unless the table says otherwise). Prints tables and writes a dated JSON
+file to ``benchmarks/results``.
 
 The scene is a box-shaped room seen from inside, which imitates the output of a feed-forward model: one flat Gaussian
 per source pixel, slightly off the surface, slightly misaligned, with varied size and opacity.
@@ -10,11 +10,8 @@ per source pixel, slightly off the surface, slightly misaligned, with varied siz
 
 from __future__ import annotations
 
-import json
 import os
-import time
 from dataclasses import asdict, dataclass, replace
-from typing import Any
 
 import torch
 from common import MEGABYTE, machine, parser, used_seconds, write_results
@@ -25,7 +22,9 @@ from vg2gt.evaluation.tables import print_table
 from vg2gt.geometry.cameras import invert_rigid
 from vg2gt.geometry.rotations import matrix_to_quat
 from vg2gt.geometry.spherical_harmonics import rgb_to_sh
-from vg2gt.rendering import render
+from vg2gt.profiling import reset_peak_memory
+from vg2gt.rendering import Renderer
+from vg2gt.rendering.options import Mode
 from vg2gt.types import Cameras, Gaussians
 
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
@@ -36,19 +35,17 @@ SOURCES = 8
 def room_cameras(views: int, size: tuple[int, int]) -> Cameras:
     """Returns cameras ``[1, views]`` on a line that look at the room's far corner."""
     height, width = size
-    poses = []
-    for index in range(views):
-        step = index / max(views - 1, 1)
-        eye = torch.tensor([0.6 + 0.5 * step, 1.3 - 0.2 * step, 0.5 + 0.9 * step])
-        forward = F.normalize(torch.tensor([3.6, 1.5, 2.0 + 0.8 * step]) - eye, dim=0)
-        right = F.normalize(torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]), forward), dim=0)
-        rotation = torch.stack((right, torch.linalg.cross(forward, right), forward))
-        pose = torch.eye(4)
-        pose[:3, :3], pose[:3, 3] = rotation, -rotation @ eye
-        poses.append(pose)
+    step = torch.linspace(0, 1, views)[:, None]
+    eye = torch.tensor([0.6, 1.3, 0.5]) + step * torch.tensor([0.5, -0.2, 0.9])
+    target = torch.tensor([3.6, 1.5, 2.0]) + step * torch.tensor([0.0, 0.0, 0.8])
+    forward = F.normalize(target - eye, dim=-1)
+    right = F.normalize(torch.linalg.cross(torch.tensor([[0.0, 1.0, 0.0]]), forward), dim=-1)
+    pose = torch.eye(4).repeat(views, 1, 1)
+    pose[:, :3, :3] = torch.stack((right, torch.linalg.cross(forward, right), forward), 1)
+    pose[:, :3, 3:] = -pose[:, :3, :3] @ eye[..., None]
     focal = 0.8 * width
     intrinsics = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    return Cameras(torch.stack(poses)[None], intrinsics.expand(1, views, 3, 3).clone(), size)
+    return Cameras(pose[None], intrinsics.expand(1, views, 3, 3).clone(), size)
 
 
 def room_gaussians(count: int, size: tuple[int, int], sigma: float = 1.0, seed: int = 0) -> Gaussians:
@@ -101,198 +98,97 @@ class Case:
     gaussians: int
     size: tuple[int, int] = (224, 448)
     views: int = 1
-    mode: str = "solid"
+    mode: Mode = "solid"
     geometry: bool = True
     threads: int = 1
-    sigma: float = 1.0
 
     @property
-    def scene(self) -> tuple[Any, ...]:
-        """Properties that cases must share to be compared."""
+    def scene(self) -> tuple[int, tuple[int, int], int]:
+        """What determines Gaussians and cameras."""
         return self.gaussians, self.size, self.views
 
 
 @dataclass
 class Timing:
-    """Best times of a case in milliseconds (``wall`` is wall time of both passes), and peak GPU memory in MB."""
+    """Best times of a case in milliseconds, and peak GPU memory in MB."""
 
     forward: float = float("inf")
     backward: float = float("inf")
-    wall: float = float("inf")
     memory: float = 0.0
-
-    @property
-    def total(self) -> float:
-        """Sum of forward and backward."""
-        return self.forward + self.backward
-
-
-def build(case: Case, device: torch.device) -> tuple[Gaussians, Cameras]:
-    """Returns the case's scene on the device; its parameters require gradients."""
-    gaussians = room_gaussians(case.gaussians, case.size, case.sigma).to(device)
-    gaussians = gaussians.map(lambda t: t.requires_grad_() if t.is_floating_point() else t)
-    return gaussians, room_cameras(case.views, case.size).to(device)
 
 
 def measure_once(case: Case, gaussians: Gaussians, cameras: Cameras) -> Timing:
     """Times one forward and one backward pass with random incoming gradients."""
     torch.set_num_threads(case.threads)
     device = cameras.intrinsics.device
-    if device.type == "cuda":
-        torch.cuda.reset_peak_memory_stats(device)
-        before = torch.cuda.memory_allocated(device)
-    start, clock = used_seconds(device), time.perf_counter()
-    outputs = _run(case, gaussians, cameras)
-    middle, forward_wall = used_seconds(device), time.perf_counter() - clock
+    reset_peak_memory(device)
+    before = torch.cuda.memory_allocated(device) if device.type == "cuda" else 0
+    start = used_seconds(device)
+    renderer = Renderer(case.mode, implementation=case.implementation, geometry=case.geometry)  # type: ignore[arg-type]
+    out = renderer(gaussians, cameras)
+    forward = used_seconds(device) - start
+    outputs = [out.color, out.depth, out.normal, out.alpha] if case.geometry else [out.color]
     weights = [torch.randn_like(output) for output in outputs]
-    resume, clock = used_seconds(device), time.perf_counter()
+    start = used_seconds(device)
     torch.autograd.grad(outputs, [getattr(gaussians, name) for name in PARAMETERS], weights, allow_unused=True)
-    end = used_seconds(device)
-    wall = 1e3 * (forward_wall + time.perf_counter() - clock)
+    backward = used_seconds(device) - start
     memory = (torch.cuda.max_memory_allocated(device) - before) / MEGABYTE if device.type == "cuda" else 0.0
-    return Timing(1e3 * (middle - start), 1e3 * (end - resume), wall, memory)
-
-
-def _run(case: Case, gaussians: Gaussians, cameras: Cameras) -> list[Tensor]:
-    if case.implementation == "gsplat":
-        return _run_gsplat(gaussians, cameras)
-    out = render(
-        gaussians,
-        cameras,
-        case.mode,  # type: ignore[arg-type]
-        implementation=case.implementation,  # type: ignore[arg-type]
-        geometry=case.geometry,
-    )
-    return [out.color, out.depth, out.normal, out.alpha] if case.geometry else [out.color]
-
-
-def _run_gsplat(gaussians: Gaussians, cameras: Cameras) -> list[Tensor]:
-    """Renders colour and expected depth with gsplat's rasteriser."""
-    from gsplat import rasterization  # pyright: ignore[reportMissingImports]
-
-    height, width = cameras.size
-    colors, alphas, _ = rasterization(
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales,
-        gaussians.opacities,
-        gaussians.sh,
-        cameras.world_to_camera[0],
-        cameras.intrinsics[0],
-        width,
-        height,
-        sh_degree=0,
-        render_mode="RGB+ED",
-    )
-    return [colors, alphas]
+    return Timing(1e3 * forward, 1e3 * backward, memory)
 
 
 def compare(cases: list[Case], device: torch.device, passes: int) -> list[Timing]:
-    """Measures the cases alternately; the first pass is a warm-up."""
+    """Measures the cases alternately; the first pass is a warm-up, and the dense reference gets a single other one."""
     scenes = {}
     for case in cases:
-        key = (case.gaussians, case.size, case.views, case.sigma)
-        if key not in scenes:
-            scenes[key] = build(case, device)
+        gaussians = room_gaussians(case.gaussians, case.size).to(device)
+        gaussians = gaussians.map(lambda t: t.requires_grad_() if t.is_floating_point() else t)
+        scenes[case.scene] = gaussians, room_cameras(case.views, case.size).to(device)
     best = [Timing() for _ in cases]
     for number in range(passes + 1):
         for case, timing in zip(cases, best, strict=True):
-            slow = case.implementation == "dense"
-            if slow and number > 1:
+            if case.implementation == "dense" and number > 1:
                 continue
-            once = measure_once(case, *scenes[(case.gaussians, case.size, case.views, case.sigma)])
+            once = measure_once(case, *scenes[case.scene])
             if number > 0:
-                timing.forward = min(timing.forward, once.forward)
-                timing.backward = min(timing.backward, once.backward)
-                timing.wall = min(timing.wall, once.wall)
+                timing.forward, timing.backward = min(timing.forward, once.forward), min(timing.backward, once.backward)
                 timing.memory = max(timing.memory, once.memory)
     return best
 
 
-def cpu_suites(quick: bool) -> dict[str, list[Case]]:
-    """Returns the cases for a CPU, by table."""
-    base = Case("cpu", 100_000)
-    cores = os.cpu_count() or 1
-    suites = {
-        "implementations": [
-            replace(base, gaussians=1_500, size=(40, 80), sigma=1.2, implementation=name) for name in ("cpu", "dense")
-        ],
-        "outputs": [
-            base,
-            replace(base, geometry=False),
-            replace(base, mode="rasterized"),
-            replace(base, mode="rasterized", geometry=False),
-        ],
-    }
-    if quick:
-        return suites
-    suites["Gaussians"] = [replace(base, gaussians=n) for n in (10_000, 30_000, 100_000, 300_000)]
-    suites["views"] = [replace(base, gaussians=30_000, views=v) for v in (1, 2, 4, 8)]
-    suites["threads"] = [replace(base, views=2, threads=t) for t in sorted({1, 2, cores // 2, cores} - {0})]
-    return suites
-
-
-def gpu_suites(quick: bool) -> dict[str, list[Case]]:
-    """Returns the cases for a GPU, by table; includes gsplat if installed."""
-    try:
-        import gsplat  # noqa: F401  # pyright: ignore[reportMissingImports]
-
-        names = ("triton", "gsplat")
-    except ImportError:
-        names = ("triton",)
-    sizes = ((224, 448),) if quick else ((224, 448), (518, 518))
-    counts, views = ((100_000,), (1, 8)) if quick else ((100_000, 1_000_000), (1, 8, 18))
-    base = Case("triton", 100_000)
+def suites() -> dict[str, list[Case]]:
+    """Returns the cases by table."""
+    base, cores = Case("cpu", 100_000), os.cpu_count() or 1
+    kinds = [("solid", True), ("solid", False), ("rasterized", True), ("rasterized", False)]
     return {
-        f"{height} x {width}": [
-            replace(base, implementation=name, gaussians=count, size=(height, width), views=number)
-            for count in counts
-            for number in views
-            for name in names
-        ]
-        for height, width in sizes
+        "implementations": [Case(name, 1_500, (40, 80)) for name in ("cpu", "dense")],
+        "outputs": [replace(base, mode=mode, geometry=geometry) for mode, geometry in kinds],
+        "Gaussians": [replace(base, gaussians=n) for n in (10_000, 30_000, 100_000, 300_000)],
+        "views": [replace(base, gaussians=30_000, views=v) for v in (1, 2, 4, 8)],
+        "threads": [replace(base, views=2, threads=t) for t in sorted({1, 2, cores // 2, cores} - {0})],
     }
-
-
-def print_case_table(title: str, cases: list[Case], timings: list[Timing], unit: str) -> None:
-    """Prints one row per case, with its ratio to the first case of the same scene."""
-    head = ["implementation", "mode", "outputs", "Gaussians", "size", "views", "threads"]
-    head += ["forward", "backward", "total", "ratio", "wall"]
-    if with_memory := any(timing.memory for timing in timings):
-        head.append("peak MB")
-    first: dict[tuple[Any, ...], float] = {}
-    rows = []
-    for case, timing in zip(cases, timings, strict=True):
-        reference = first.setdefault(case.scene, timing.total)
-        row = [case.implementation, case.mode, "all" if case.geometry else "colour", f"{case.gaussians:,}"]
-        row += [f"{case.size[0]}x{case.size[1]}", str(case.views), str(case.threads)]
-        row += [f"{value:.1f}" for value in (timing.forward, timing.backward, timing.total)]
-        row += [f"{timing.total / reference:.2f}", f"{timing.wall:.1f}"]
-        rows.append(row + ([f"{timing.memory:.0f}"] if with_memory else []))
-    print_table(head, rows, title=f"{title} ({unit})", text_columns=7, width=120)
 
 
 def main() -> None:
     """Measures, prints and writes."""
-    options = parser(__doc__, device=True)
+    options = parser(__doc__)
     options.add_argument("--passes", type=int, default=3)
-    options.add_argument("--quick", action="store_true", help="the small tables only")
     arguments = options.parse_args()
-    device = torch.device(arguments.device)
-    where = machine(device)
-    print(json.dumps(where))
-    suites = (gpu_suites if device.type == "cuda" else cpu_suites)(arguments.quick)
-    unit = "milliseconds" if device.type == "cuda" else "core-milliseconds"
-    results: dict[str, tuple[list[Case], list[Timing]]] = {}
-    for title, cases in suites.items():
-        results[title] = cases, compare(cases, device, arguments.passes)
-        print_case_table(title, *results[title], unit)
-    tables = {
-        title: [asdict(case) | asdict(timing) for case, timing in zip(*result, strict=True)]
-        for title, result in results.items()
-    }
-    content = {"machine": where, "unit": unit, "passes": arguments.passes, "tables": tables}
-    write_results(arguments.out, f"render-{device.type}", content)
+    tables: dict[str, list[dict[str, object]]] = {}
+    head = ["implementation", "mode", "outputs", "Gaussians", "size", "views", "threads"]
+    head += ["forward", "backward", "total", "ratio"]
+    for title, cases in suites().items():
+        timings = compare(cases, torch.device("cpu"), arguments.passes)
+        rows = []
+        for case, timing in zip(cases, timings, strict=True):
+            total, reference = timing.forward + timing.backward, timings[0].forward + timings[0].backward
+            row = [case.implementation, case.mode, "all" if case.geometry else "colour", f"{case.gaussians:,}"]
+            row += [f"{case.size[0]}x{case.size[1]}", str(case.views), str(case.threads)]
+            row += [f"{value:.1f}" for value in (timing.forward, timing.backward, total)]
+            rows.append([*row, f"{total / reference:.2f}"])
+        print_table(head, rows, title=f"{title} (core-milliseconds)", text_columns=7, width=120)
+        tables[title] = [asdict(case) | asdict(timing) for case, timing in zip(cases, timings, strict=True)]
+    content = {"machine": machine(), "unit": "core-milliseconds", "passes": arguments.passes, "tables": tables}
+    write_results(arguments.out, "render-cpu", content)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ def test_every_script_is_in_the_table() -> None:
     assert set(re.findall(r"`(\w+\.py)`", (BENCHMARKS / "README.md").read_text())) - {"train.py"} == scripts - helpers
 
 
-@pytest.mark.parametrize("part", ["render", "reconstruct", "loading"])
+@pytest.mark.parametrize("part", ["render", "reconstruct"])
 def test_parts_of_the_gpu_script_run_on_a_cpu(part: str, benchmark_script, tmp_path: Path) -> None:
     gpu = benchmark_script("gpu")
     found = gpu.measure(part, gpu.Setting(torch.device("cpu"), small=True), tmp_path / "part.json")

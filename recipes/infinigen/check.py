@@ -94,17 +94,11 @@ def check_room(room: Path) -> dict[str, float | int | bool]:
     finite = depth[np.isfinite(depth)]
     contradictions, agreeing, difference = np.mean(figures, 0) if figures else (1.0, 0.0, 1.0)
     beyond = 1 - finite.size / depth.size
-    return {
-        "views": len(views),
-        "pairs": len(figures),
-        "contradictions": round(float(contradictions), 4),
-        "agreeing": round(float(agreeing), 4),
-        "difference": round(float(difference), 5),
-        "beyond": round(beyond, 4),
-        "nearest": round(float(finite.min(initial=np.inf)), 3),
-        "median": round(float(np.median(finite)), 3) if finite.size else 0.0,
-        "ok": bool(contradictions <= _MOST_CONTRADICTIONS and beyond <= _MOST_BEYOND),
-    }
+    found = {"contradictions": contradictions, "agreeing": agreeing, "difference": difference, "beyond": beyond}
+    found |= {"nearest": finite.min(initial=np.inf), "median": np.median(finite) if finite.size else 0.0}
+    ok = bool(contradictions <= _MOST_CONTRADICTIONS and beyond <= _MOST_BEYOND)
+    counts = {"views": len(views), "pairs": len(figures)}
+    return counts | {name: round(float(value), 5) for name, value in found.items()} | {"ok": ok}
 
 
 if __name__ == "__main__":

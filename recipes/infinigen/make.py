@@ -4,9 +4,9 @@ Makes one room after another on one thread: about 15 core-minutes for a room, an
 after an interruption, run the same command again; finished rooms and views are kept. Needs only the standard library;
 Infinigen and Blender are installed into an environment of their own (``OUT/environment``, or ``--env``).
 
-Results: ``OUT/train/room_NNNN`` and ``OUT/held_out/room_NNNN``, folders for ``data=infinigen``. A room that fails
-leaves ``OUT/work/room_NNNN/failed.txt`` and is skipped from then on. A room that does not pass the check goes to
-``OUT/rejected``.
+Results: ``OUT/train/room_NNNN`` and ``OUT/held_out/room_NNNN``, and their paths as scenes in ``OUT/paths``, folders for
+``data=infinigen``. A room that fails leaves ``OUT/work/room_NNNN/failed.txt`` and is skipped from then on. A room that
+does not pass the check goes to ``OUT/rejected``.
 """
 
 from __future__ import annotations
@@ -25,13 +25,8 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 INFINIGEN, BLENDER = "infinigen==1.15.5", "bpy==4.2.0"
 # Infinigen's name of a kind of room, and prefix of the names of its floors.
-KINDS = {
-    "DiningRoom": "dining-room",
-    "LivingRoom": "living-room",
-    "Bedroom": "bedroom",
-    "Kitchen": "kitchen",
-    "Bathroom": "bathroom",
-}
+KINDS = {"DiningRoom": "dining-room", "LivingRoom": "living-room"}
+KINDS |= {"Bedroom": "bedroom", "Kitchen": "kitchen", "Bathroom": "bathroom"}
 HELD_OUT = (3, 7, 10, 14, 16, 24, 28, 30, 32, 36)
 """Seeds excluded from training: two rooms of each kind among the first forty."""
 _THREADS = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "MKL", "OPENBLAS", "NUMBA")}
@@ -42,10 +37,6 @@ _FASTER = (
     "compose_indoors.solve_steps_large=60", "compose_indoors.solve_steps_medium=25",
     "restrict_solving.solve_max_parent_obj=4",
 )  # fmt: skip
-
-
-class StageError(Exception):
-    """A stage of a room failed."""
 
 
 def kind(seed: int) -> str:
@@ -84,18 +75,28 @@ def make_environment(env: Path, python: str) -> Path:
     return interpreter
 
 
-def link_packages(interpreter: Path, folder: Path) -> None:
-    """Creates a working folder with links to Infinigen's packages, where it looks for its settings."""
-    folder.mkdir(parents=True, exist_ok=True)
-    where = subprocess.run(
-        [str(interpreter), "-c", "import sysconfig; print(sysconfig.get_paths()['purelib'])"],
-        capture_output=True, text=True, check=True,
-    )  # fmt: skip
-    for package in ("infinigen", "infinigen_examples"):
-        link = folder / package
-        if not link.exists():
-            link.unlink(missing_ok=True)
-            link.symlink_to(Path(where.stdout.strip()) / package)
+def link_paths(room: Path) -> None:
+    """Links the views of every kind of path of a room into a scene ``paths/PART/ROOM/KIND``, unless it exists.
+
+    Loaders draw neighbouring frames, but views of different paths of a room hardly overlap. Turns on the spot are left
+    out, as they have no parallax.
+    """
+    kinds: dict[str, set[int]] = {}
+    for number, view in enumerate(json.loads((room / "views.json").read_text())):
+        kinds.setdefault(view["path"].rsplit("_", 1)[0], set()).add(number)
+    kinds.pop("turn", None)
+    for path_kind, numbers in kinds.items():
+        scene = room.parents[1] / "paths" / room.parent.name / room.name / path_kind
+        new = scene.with_name(f"{path_kind}.new")  # renamed when complete
+        if scene.exists():
+            continue
+        shutil.rmtree(new, ignore_errors=True)
+        for file in sorted(room.glob("frames/*/camera_*/*")):
+            if int(file.stem.split("_")[3]) in numbers:  # such as Image_0_0_0007_0
+                link = new / file.relative_to(room)
+                link.parent.mkdir(parents=True, exist_ok=True)
+                link.symlink_to(os.path.relpath(file, link.parent))
+        new.rename(scene)
 
 
 class Rooms:
@@ -104,23 +105,28 @@ class Rooms:
     Args:
         out: output folder.
         interpreter: Python interpreter of Infinigen's environment.
-        args: command-line options.
+        views: number of views per room.
+        size: image ``(height, width)``.
 
     Raises:
         SystemExit: if another process makes rooms in the folder.
     """
 
-    def __init__(self, out: Path, interpreter: Path, args: argparse.Namespace) -> None:
-        self.out, self.interpreter, self.args = out, interpreter, args
+    def __init__(self, out: Path, interpreter: Path, views: int = 60, size: tuple[int, int] = (112, 224)) -> None:
+        self.out, self.interpreter = out, interpreter
+        self.view_options = ["--views", views, "--size", *size]
+        # a working folder with links to Infinigen's packages, where it looks for its settings
         self.links = out / "work" / "packages"
-        link_packages(interpreter, self.links)
+        self.links.mkdir(parents=True, exist_ok=True)
         self._lock = (out / "work" / "lock").open("w")
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
-            raise SystemExit(
-                f"another process is making rooms in {out}: wait for it, stop it, or use another --out"
-            ) from None
+            raise SystemExit(f"another process is making rooms in {out}: wait for it, or use another --out") from None
+        for package in ("infinigen", "infinigen_examples"):
+            (self.links / package).unlink(missing_ok=True)
+            (packages,) = interpreter.parents[1].glob("lib/python*/site-packages")
+            (self.links / package).symlink_to(packages / package)
 
     def make(self, seed: int) -> None:
         """Makes one room, unless it exists or failed before."""
@@ -136,50 +142,45 @@ class Rooms:
             if not (work / "coarse").exists():
                 self._coarse(seed, work)
             self._views(seed, room, work)
-        except StageError as error:
-            (work / "failed.txt").write_text(f"{error}\n")
-            print(f"{room} failed: {error}", flush=True)
+        except (subprocess.CalledProcessError, FileNotFoundError) as error:
+            (work / "failed.txt").write_text(f"{error}; see the logs in {work}\n")
+            print(f"{room} failed: {error}; see the logs in {work}", flush=True)
 
     def _coarse(self, seed: int, work: Path) -> None:
         new = work / "coarse.new"
         shutil.rmtree(new, ignore_errors=True)
         command = [
-            HERE / "coarse.py", "--seed", seed, "--task", "coarse", "--output_folder", new,
+            "coarse.py", "--seed", seed, "--task", "coarse", "--output_folder", new,
             "-g", "fast_solve.gin", "singleroom.gin", "-p", *_FASTER,
             f'restrict_solving.restrict_parent_rooms=["{kind(seed)}"]',
         ]  # fmt: skip
-        self._stage("coarse", command, work / "coarse.log")
-        if not (new / "scene.blend").exists():
-            raise StageError(f"coarse wrote no scene.blend; see {work / 'coarse.log'}")
+        self._stage(command, work / "coarse.log")
+        (new / "scene.blend").stat()  # raises an error if it was not written
         new.rename(work / "coarse")
 
     def _views(self, seed: int, room: str, work: Path) -> None:
-        args, views = self.args, work / "views"
-        command = [
-            HERE / "views.py", work / "coarse" / "scene.blend", views, "--seed", seed, "--kind", kind(seed),
-            "--views", args.views, "--size", *args.size, "--samples", args.samples,
-        ]  # fmt: skip
-        self._stage("views", command, work / "views.log")
-        log = work / "check.json"
-        self._stage("check", [HERE / "check.py", views], log)
-        figures = json.loads(log.read_text().splitlines()[-1])
+        views = work / "views"
+        scene = ["views.py", work / "coarse" / "scene.blend", views, "--seed", seed, "--kind", kind(seed)]
+        self._stage([*scene, *self.view_options], work / "views.log")
+        self._stage(["check.py", views], work / "check.json")
+        figures = json.loads((work / "check.json").read_text().splitlines()[-1])
         (views / "check.json").write_text(json.dumps(figures | {"seed": seed, "kind": kind(seed)}) + "\n")
         print(f"{room} ({kind(seed)}): {figures}", flush=True)
         place = self.out / (part(seed) if figures["ok"] else "rejected")
         place.mkdir(exist_ok=True)
         views.rename(place / room)
-        if not args.keep_blend:
-            shutil.rmtree(work / "coarse")
+        shutil.rmtree(work / "coarse")
+        if figures["ok"]:
+            link_paths(place / room)
 
-    def _stage(self, stage: str, command: Sequence[object], log: Path) -> None:
-        """Runs one stage in Infinigen's environment."""
+    def _stage(self, command: Sequence[object], log: Path) -> None:
+        """Runs a script of this folder in Infinigen's environment."""
+        script, *options = map(str, command)
         with log.open("w") as file:
-            ended = subprocess.run(
-                [str(self.interpreter), *map(str, command)],
+            subprocess.run(
+                [str(self.interpreter), str(HERE / script), *options], check=True,
                 cwd=self.links, env={**os.environ, **_THREADS}, stdout=file, stderr=subprocess.STDOUT,
             )  # fmt: skip
-        if ended.returncode:
-            raise StageError(f"{stage}: exit {ended.returncode}; see {log}")
 
 
 def main() -> None:
@@ -191,15 +192,16 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="output folder")
     parser.add_argument("--views", type=int, default=60, help="views per room")
     parser.add_argument("--size", type=int, nargs=2, default=(112, 224), metavar=("HEIGHT", "WIDTH"))
-    parser.add_argument("--samples", type=int, default=8, help="samples per pixel")
-    parser.add_argument("--keep-blend", action="store_true", help="keep every room's scene.blend (400 to 500 MB)")
     parser.add_argument("--env", type=Path, help="folder of Infinigen's environment (3 GB)")
     parser.add_argument("--python", default="python3.11", help="interpreter that the environment is made with")
     args = parser.parse_args()
     out = args.out.resolve()
     out.mkdir(parents=True, exist_ok=True)
+    for place in ("train", "held_out"):
+        for room in sorted((out / place).glob("room_*")):
+            link_paths(room)
     interpreter = make_environment((args.env or out / "environment").resolve(), args.python)
-    rooms = Rooms(out, interpreter, args)
+    rooms = Rooms(out, interpreter, args.views, args.size)
     for seed in range(args.rooms):
         rooms.make(seed)
 

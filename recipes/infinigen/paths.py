@@ -1,6 +1,8 @@
 """Camera paths through a room that imitate handheld photography: walks, turns, orbits, near and far views.
 
-Paths query a ``Space`` for free space and visibility, so they do not need Blender. World: z up, metres.
+Paths ask a room, such as ``views.Room``, for free space and visibility, so they do not need Blender: ``low`` and
+``high``, the corners of its bounding box ``[3]``; ``objects``, centre and radius of what to look at ``[n, 4]``;
+``inside(point)``; and ``cast(origin, direction)``. World: z up, metres.
 """
 
 from __future__ import annotations
@@ -8,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,22 +23,6 @@ _MARGIN = 0.22  # free space around a camera in metres
 _TRIES = 60
 SHARES = {"walk": 12, "turn": 8, "orbit_near": 12, "orbit_far": 12, "near": 8, "far": 8}
 """Number of views per kind of path, out of 60."""
-
-
-class Space(Protocol):
-    """Geometry of a room."""
-
-    low: Vector  # lower corner of the bounding box [3]; z is the floor
-    high: Vector  # upper corner [3]; z is the ceiling
-    objects: Vector  # centre and radius of the objects to look at [n, 4]
-
-    def inside(self, point: Vector) -> bool:
-        """Returns whether a point is above the room's own floor."""
-        ...
-
-    def cast(self, origin: Vector, direction: Vector) -> tuple[float, bool]:
-        """Returns the distance to the first surface along a unit direction (inf: none), and whether its back is hit."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -69,7 +55,7 @@ class View:
         return pose
 
 
-def plan(space: Space, rng: np.random.Generator, count: int) -> list[View]:
+def plan(space: Any, rng: np.random.Generator, count: int) -> list[View]:
     """Draws ``count`` views on paths of all kinds; if the room lacks space for a kind, other kinds get its views.
 
     Raises:
@@ -87,28 +73,38 @@ def plan(space: Space, rng: np.random.Generator, count: int) -> list[View]:
     return views
 
 
-def _several(space: Space, rng: np.random.Generator, kind: str, quota: int, first: int = 0) -> list[View]:
-    """Draws paths of one kind, each the longest of several tries, until the quota is met or no path is found."""
+def _several(space: Any, rng: np.random.Generator, kind: str, quota: int, first: int = 0) -> list[View]:
+    """Draws paths of one kind until the quota is met or no path is found."""
     views: list[View] = []
     number = first
     while len(views) < quota:
         field_of_view = np.radians(rng.uniform(55, 85))
-        path = _PATHS[kind](space, rng, quota - len(views), field_of_view)
+        path = _longest(space, rng, kind, quota - len(views), field_of_view)
         # Very short paths have too little overlap; accept them only to fill the rest of a quota.
         if len(path) < min(3, quota - len(views)):
             break
-        views += [
-            View(f"{kind}_{number}", position, forward, rng.normal(0, 0.02), field_of_view)
-            for position, forward in path
-        ]
+        views += [View(f"{kind}_{number}", *look, rng.normal(0, 0.02), field_of_view) for look in path]
         number += 1
     return views
 
 
-_Path = list[tuple[Vector, Vector]]
+_Path = list[tuple[Vector, Vector]]  # positions and viewing directions
 
 
-def _free(space: Space, point: Vector, margin: float = _MARGIN) -> bool:
+def _longest(space: Any, rng: np.random.Generator, kind: str, count: int, field_of_view: float) -> _Path:
+    """The longest of several random paths, with at most ``count`` views."""
+    draw, most, tries = _PATHS[kind]
+    best: _Path = []
+    if kind in ("orbit_near", "orbit_far", "near") and not len(space.objects):
+        return best
+    for _ in range(tries):
+        best = max(best, draw(space, rng, count, field_of_view), key=len)
+        if len(best) >= min(count, most):
+            break
+    return best[: min(count, most)]
+
+
+def _free(space: Any, point: Vector, margin: float = _MARGIN) -> bool:
     """Whether a camera fits: inside the room, with free space around it, and not inside a solid (many back hits)."""
     if not space.inside(point) or not space.low[2] + 0.15 < point[2] < space.high[2] - 0.15:
         return False
@@ -121,7 +117,7 @@ def _free(space: Space, point: Vector, margin: float = _MARGIN) -> bool:
     return backs < len(_SIDES) / 3
 
 
-def _looks_at_room(space: Space, position: Vector, forward: Vector, field_of_view: float, least: float) -> bool:
+def _looks_at_room(space: Any, position: Vector, forward: Vector, field_of_view: float, least: float) -> bool:
     """Whether a view shows enough of the room, tested with a grid of rays.
 
     The median distance must be at least ``least``, and the smallest above 0.1 m. If ``least`` is 0.8 m or more, the
@@ -148,12 +144,12 @@ def _toward(position: Vector, target: Vector) -> Vector:
     return (target - position) / np.linalg.norm(target - position)
 
 
-def _sees(space: Space, position: Vector, target: Vector, radius: float) -> bool:
+def _sees(space: Any, position: Vector, target: Vector, radius: float) -> bool:
     """Whether an object of some radius at ``target`` is not occluded."""
     return space.cast(position, _toward(position, target))[0] > np.linalg.norm(target - position) - 1.2 * radius - 0.1
 
 
-def _stand(space: Space, rng: np.random.Generator, margin: float = _MARGIN) -> Vector | None:
+def _stand(space: Any, rng: np.random.Generator, margin: float = _MARGIN) -> Vector | None:
     """Draws a free position at the height of a handheld camera, 1.1 to 1.75 m; None if none is found."""
     for _ in range(_TRIES):
         point = rng.uniform(space.low, space.high)
@@ -163,110 +159,83 @@ def _stand(space: Space, rng: np.random.Generator, margin: float = _MARGIN) -> V
     return None
 
 
-def _longest(draw: Callable[[], _Path], count: int, tries: int) -> _Path:
-    best: _Path = []
-    for _ in range(tries):
-        path = draw()
-        if len(path) > len(best):
-            best = path
-        if len(best) >= count:
-            break
-    return best[:count]
-
-
-def _walk(space: Space, rng: np.random.Generator, count: int, field_of_view: float) -> _Path:
+def _walk(space: Any, rng: np.random.Generator, count: int, field_of_view: float) -> _Path:
     """A straight walk with bobbing and a slow pan, in steps of 8 to 25 cm."""
-
-    def draw() -> _Path:
-        start, end = _stand(space, rng), _stand(space, rng)
-        if start is None or end is None or np.linalg.norm(end - start) < 0.8:
-            return []
-        step = rng.uniform(0.08, 0.25)
-        way = _toward(start, end)
-        pan = np.arctan2(way[1], way[0]) + rng.choice((0.0, 0.6, -0.6, 1.57, -1.57)) + rng.normal(0, 0.2)
-        turn, nod = rng.normal(0, 0.06), rng.uniform(-0.35, 0.05)
-        path: _Path = []
-        for i in range(min(count, 1 + int(np.linalg.norm(end - start) / step))):
-            position = start + i * step * way + rng.normal(0, 0.015, 3)
-            forward = _look(pan + i * turn + rng.normal(0, 0.02), nod + rng.normal(0, 0.02))
-            if not _free(space, position) or not _looks_at_room(space, position, forward, field_of_view, 0.8):
-                break
-            path.append((position, forward))
-        return path
-
-    return _longest(draw, min(count, 12), 12)
+    start, end = _stand(space, rng), _stand(space, rng)
+    if start is None or end is None or np.linalg.norm(end - start) < 0.8:
+        return []
+    step = rng.uniform(0.08, 0.25)
+    way = _toward(start, end)
+    pan = np.arctan2(way[1], way[0]) + rng.choice((0.0, 0.6, -0.6, 1.57, -1.57)) + rng.normal(0, 0.2)
+    turn, nod = rng.normal(0, 0.06), rng.uniform(-0.35, 0.05)
+    path: _Path = []
+    for i in range(min(count, 1 + int(np.linalg.norm(end - start) / step))):
+        position = start + i * step * way + rng.normal(0, 0.015, 3)
+        forward = _look(pan + i * turn + rng.normal(0, 0.02), nod + rng.normal(0, 0.02))
+        if not _free(space, position) or not _looks_at_room(space, position, forward, field_of_view, 0.8):
+            break
+        path.append((position, forward))
+    return path
 
 
-def _turn(space: Space, rng: np.random.Generator, count: int, field_of_view: float) -> _Path:
+def _turn(space: Any, rng: np.random.Generator, count: int, field_of_view: float) -> _Path:
     """A turn on the spot in steps of 10 to 35 degrees, with the camera 5 to 35 cm from the axis."""
-
-    def draw() -> _Path:
-        stand = _stand(space, rng, 0.4)
-        if stand is None:
-            return []
-        step, arm = np.radians(rng.uniform(10, 35)) * rng.choice((-1, 1)), rng.uniform(0.05, 0.35)
-        pan, nod = rng.uniform(0, 2 * np.pi), rng.uniform(-0.35, 0.1)
-        path: _Path = []
-        for i in range(count):
-            forward = _look(pan + i * step, nod + rng.normal(0, 0.03))
-            position = stand + arm * _look(pan + i * step, 0.0) + rng.normal(0, 0.01, 3)
-            if not _free(space, position) or not _looks_at_room(space, position, forward, field_of_view, 0.8):
-                break
-            path.append((position, forward))
-        return path
-
-    return _longest(draw, min(count, 10), 12)
+    stand = _stand(space, rng, 0.4)
+    if stand is None:
+        return []
+    step, arm = np.radians(rng.uniform(10, 35)) * rng.choice((-1, 1)), rng.uniform(0.05, 0.35)
+    pan, nod = rng.uniform(0, 2 * np.pi), rng.uniform(-0.35, 0.1)
+    path: _Path = []
+    for i in range(count):
+        forward = _look(pan + i * step, nod + rng.normal(0, 0.03))
+        position = stand + arm * _look(pan + i * step, 0.0) + rng.normal(0, 0.01, 3)
+        if not _free(space, position) or not _looks_at_room(space, position, forward, field_of_view, 0.8):
+            break
+        path.append((position, forward))
+    return path
 
 
-def _orbit(near: bool, space: Space, rng: np.random.Generator, count: int, field_of_view: float) -> _Path:
+def _orbit(near: bool, space: Any, rng: np.random.Generator, count: int, field_of_view: float) -> _Path:
     """An orbit around an object in steps of 10 to 40 degrees; positions that are not free are skipped."""
-
-    def draw() -> _Path:
-        *center, size = space.objects[rng.integers(len(space.objects))]
-        target = np.array(center)
-        distance = size + (rng.uniform(0.35, 0.9) if near else rng.uniform(1.0, 2.5))
-        height = target[2] + (rng.uniform(0.05, 0.6) if near else rng.uniform(0.2, 1.0))
-        height = min(max(height, space.low[2] + 0.3), space.high[2] - 0.3)
-        start, step = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(10, 40)) * rng.choice((-1, 1))
-        path: _Path = []
-        for i in range(min(2 * count, int(2 * np.pi / abs(step)))):
-            for scale in (1.0, 0.8, 1.25):
-                offset = scale * distance * _look(start + i * step, 0.0)
-                position = np.array([target[0], target[1], height]) + offset + rng.normal(0, 0.02, 3)
-                forward = _toward(position, target + rng.normal(0, 0.06 * size + 0.02, 3))
-                if _sees(space, position, target, size) and _free(space, position):
-                    path.append((position, forward))
-                    break
-        return path
-
-    return _longest(draw, min(count, 12), 40) if len(space.objects) else []
-
-
-def _near(space: Space, rng: np.random.Generator, count: int, field_of_view: float) -> _Path:
-    """A sideways pass in front of an object, at 30 to 70 cm."""
-
-    def draw() -> _Path:
-        *center, size = space.objects[rng.integers(len(space.objects))]
-        target = np.array(center)
-        away = _look(rng.uniform(0, 2 * np.pi), rng.uniform(0.0, 0.9))
-        middle = target + (0.6 * size + rng.uniform(0.3, 0.7)) * away
-        side = np.cross(away, (0.0, 0.0, 1.0)) / np.cos(np.arcsin(away[2]))
-        step = rng.uniform(0.04, 0.12)
-        path: _Path = []
-        for i in range(count):
-            position = middle + (i - count / 2) * step * side + rng.normal(0, 0.01, 3)
-            forward = _toward(position, target + 0.5 * (i - count / 2) * step * side)
-            seen = _sees(space, position, target, size) and _looks_at_room(space, position, forward, field_of_view, 0.3)
-            if seen and _free(space, position):
+    *center, size = space.objects[rng.integers(len(space.objects))]
+    target = np.array(center)
+    distance = size + (rng.uniform(0.35, 0.9) if near else rng.uniform(1.0, 2.5))
+    height = target[2] + (rng.uniform(0.05, 0.6) if near else rng.uniform(0.2, 1.0))
+    height = min(max(height, space.low[2] + 0.3), space.high[2] - 0.3)
+    start, step = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(10, 40)) * rng.choice((-1, 1))
+    path: _Path = []
+    for i in range(min(2 * count, int(2 * np.pi / abs(step)))):
+        for scale in (1.0, 0.8, 1.25):
+            offset = scale * distance * _look(start + i * step, 0.0)
+            position = np.array([target[0], target[1], height]) + offset + rng.normal(0, 0.02, 3)
+            forward = _toward(position, target + rng.normal(0, 0.06 * size + 0.02, 3))
+            if _sees(space, position, target, size) and _free(space, position):
                 path.append((position, forward))
-            elif path:
                 break
-        return path
-
-    return _longest(draw, min(count, 6), 40) if len(space.objects) else []
+    return path
 
 
-def _far(space: Space, rng: np.random.Generator, count: int, field_of_view: float) -> _Path:
+def _near(space: Any, rng: np.random.Generator, count: int, field_of_view: float) -> _Path:
+    """A sideways pass in front of an object, at 30 to 70 cm."""
+    *center, size = space.objects[rng.integers(len(space.objects))]
+    target = np.array(center)
+    away = _look(rng.uniform(0, 2 * np.pi), rng.uniform(0.0, 0.9))
+    middle = target + (0.6 * size + rng.uniform(0.3, 0.7)) * away
+    side = np.cross(away, (0.0, 0.0, 1.0)) / np.cos(np.arcsin(away[2]))
+    step = rng.uniform(0.04, 0.12)
+    path: _Path = []
+    for i in range(count):
+        position = middle + (i - count / 2) * step * side + rng.normal(0, 0.01, 3)
+        forward = _toward(position, target + 0.5 * (i - count / 2) * step * side)
+        seen = _sees(space, position, target, size) and _looks_at_room(space, position, forward, field_of_view, 0.3)
+        if seen and _free(space, position):
+            path.append((position, forward))
+        elif path:
+            break
+    return path
+
+
+def _far(space: Any, rng: np.random.Generator, count: int, field_of_view: float) -> _Path:
     """Views across the room from random positions (wide baselines), towards the farthest of four directions."""
     middle = (space.low + space.high) / 2
     path: _Path = []
@@ -283,11 +252,12 @@ def _far(space: Space, rng: np.random.Generator, count: int, field_of_view: floa
     return path
 
 
-_PATHS: dict[str, Callable[[Space, np.random.Generator, int, float], _Path]] = {
-    "walk": _walk,
-    "turn": _turn,
-    "orbit_near": partial(_orbit, True),
-    "orbit_far": partial(_orbit, False),
-    "near": _near,
-    "far": _far,
+# how a path of a kind is drawn, the most views that it has, and the number of tries of which the longest is taken
+_PATHS: dict[str, tuple[Callable[[Any, np.random.Generator, int, float], _Path], int, int]] = {
+    "walk": (_walk, 12, 12),
+    "turn": (_turn, 10, 12),
+    "orbit_near": (partial(_orbit, True), 12, 40),
+    "orbit_far": (partial(_orbit, False), 12, 40),
+    "near": (_near, 6, 40),
+    "far": (_far, 1_000, 1),
 }

@@ -34,11 +34,12 @@ _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # from OpenCV camera axes to Blender's
 _SKY = 1e4  # metres; Blender's depth of the sky is 1e10
 _THINGS = (0.08, 1.3)  # minimum and maximum radius of objects to look at, in metres
 _FIXED = ("Window", "Door", "CeilingLight", "Skirting", "Curtain", "Rug", "Ceiling", "Wall", "Pillar")
+_SAMPLES = 8  # per pixel of the colour pass
 _GRAY = 0.22  # target of the exposure: mean linear brightness
 
 
 class Room:
-    """Room of the open Blender file, as a ``paths.Space``.
+    """Room of the open Blender file, as ``paths.plan`` needs it.
 
     Args:
         kind: Infinigen's name of the kind of room; if there are several, the one with most objects is used.
@@ -108,11 +109,10 @@ class Renderer:
 
     Args:
         size: image ``(height, width)``.
-        samples: samples per pixel of the colour pass.
     """
 
-    def __init__(self, size: tuple[int, int], samples: int) -> None:
-        self.size, self.samples = size, samples
+    def __init__(self, size: tuple[int, int]) -> None:
+        self.size = size
         scene = self._scene = bpy.context.scene
         self._folder = Path(tempfile.mkdtemp())
         camera = bpy.data.objects.new("view", bpy.data.cameras.new("view"))
@@ -175,7 +175,7 @@ class Renderer:
     def color(self, view: View, exposure: float, path: Path) -> None:
         """Renders the colours and writes them as JPEG."""
         self._place(view, exposure)
-        self._render(path, self.size, self.samples, "JPEG")
+        self._render(path, self.size, _SAMPLES, "JPEG")
 
     def geometry(self, view: View) -> tuple[np.ndarray, np.ndarray]:
         """Renders z-depth ``[h, w]`` in metres and normals ``[h, w, 3]`` in OpenCV camera axes; sky is inf and 0."""
@@ -244,14 +244,13 @@ def main() -> None:
     parser.add_argument("--kind", choices=list(KINDS), required=True)
     parser.add_argument("--views", type=int, default=60)
     parser.add_argument("--size", type=int, nargs=2, default=(112, 224), metavar=("HEIGHT", "WIDTH"))
-    parser.add_argument("--samples", type=int, default=8)
     args = parser.parse_args()
     started = time.process_time()
     bpy.ops.wm.open_mainfile(filepath=str(args.blend.resolve()))
     args.out.mkdir(parents=True, exist_ok=True)
     views = _planned(args.out, args.kind, args.seed, args.views)
     print(f"{len(views)} views planned after {time.process_time() - started:.0f} core seconds", flush=True)
-    renderer = Renderer(tuple(args.size), args.samples)
+    renderer = Renderer(tuple(args.size))
     cameras = args.out / "frames" / "camview" / "camera_0"
     for name in dict.fromkeys(view.path for view in views):
         path = [(i, view) for i, view in enumerate(views) if view.path == name]

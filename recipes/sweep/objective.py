@@ -55,11 +55,9 @@ def objective(
         inverse = inverse.clamp_min(1 / beyond_planes)
         t = from_inverse(inverse, sample.depth_range)
         planes.append(_cross_entropy(sweep, t, known))
-        positions.append(_mean((sweep.t - t).abs().clamp_max(0.3), known))
-        if cell == 4:
-            positions.append(_mean((encoding.refined - t).abs().clamp_max(0.3), known))
-        else:
-            positions.append(_mean((encoding.center - t).abs().clamp_max(0.3), known))
+        for position in (sweep.t, encoding.refined if cell == 4 else encoding.center):
+            positions.append(_mean((position - t).abs().clamp_max(0.3), known))
+        if cell == 2:
             terms["swept"] = _mean((encoding.swept[:, :1] + inverse.log()).abs().clamp_max(_CLAMP), finite)
     terms["planes"] = torch.stack(planes).sum()
     terms["position"] = torch.stack(positions).sum()

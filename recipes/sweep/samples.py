@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from kornia.filters import gaussian_blur2d
 from numpy.random import Generator
 from numpy.typing import NDArray
 from torch import Tensor
@@ -55,24 +56,8 @@ class Sample(NamedTuple):
     intrinsics: Tensor
     depth_range: Tensor
     sources: Tensor
-    planes: int
+    planes: int = 0
     scenes: int = 1
-
-
-class Layout(NamedTuple):
-    """Properties that all scenes of a sample share, so that they can be concatenated.
-
-    Attributes:
-        size: height and width of the images before rotation.
-        turns: number of rotations by 90 degrees.
-        planes: number of planes.
-        sources: number of sources per view.
-    """
-
-    size: tuple[int, int]
-    turns: int
-    planes: int
-    sources: int
 
 
 class TrainingSamples(Dataset[Sample]):
@@ -112,26 +97,24 @@ class TrainingSamples(Dataset[Sample]):
 
     def __getitem__(self, index: int) -> Sample:
         rng = np.random.default_rng((self.seed, index))
-        layout = Layout(
-            self.sizes[rng.choice(len(self.sizes), p=self.shares)],
-            int(rng.choice(4, p=(1 - _UPRIGHT_SHARE, _UPRIGHT_SHARE / 2, 0, _UPRIGHT_SHARE / 2))),
-            int(rng.choice(_PLANES)),
-            int(rng.choice(_SOURCES, p=_SOURCE_SHARES)),
-        )
-        parts = [self._scene(layout, rng) for _ in range(self.scenes)]
+        # equal for all scenes of a sample, so that they can be concatenated
+        size = self.sizes[rng.choice(len(self.sizes), p=self.shares)]
+        turns = int(rng.choice(4, p=(1 - _UPRIGHT_SHARE, _UPRIGHT_SHARE / 2, 0, _UPRIGHT_SHARE / 2)))
+        planes, sources = int(rng.choice(_PLANES)), int(rng.choice(_SOURCES, p=_SOURCE_SHARES))
+        parts = [self._scene(size, turns, sources, rng) for _ in range(self.scenes)]
         parts = [part._replace(sources=part.sources + n * self.views) for n, part in enumerate(parts)]
         joined = {name: torch.cat([getattr(part, name) for part in parts]) for name in Sample._fields[:6]}
-        return Sample(**joined, planes=layout.planes, scenes=self.scenes)
+        return Sample(**joined, planes=planes, scenes=self.scenes)
 
-    def _scene(self, layout: Layout, rng: Generator) -> Sample:
+    def _scene(self, size: tuple[int, int], turns: int, sources: int, rng: Generator) -> Sample:
         while True:
             files = self.more if self.share and rng.random() < self.share else self.files
             path = files[rng.integers(len(files))]
             views = _choose_views(read_scene(path), self.views, rng)
-            views = _turn(_crop(views, layout.size, rng), layout.turns)
+            views = _turn(_crop(views, size, rng), turns)
             valid = views.depth[(views.depth > 0) & views.depth.isfinite()]
             if len(valid) >= _LEAST_PIXELS:
-                return _finish(views, valid, _CUT_INDOORS if is_room(path) else _CUT, layout, rng)
+                return _finish(views, valid, _CUT_INDOORS if is_room(path) else _CUT, sources, rng)
 
 
 class _Crop(NamedTuple):
@@ -221,7 +204,7 @@ def _turn(views: _Crop, turns: int) -> _Crop:
     return _Crop(images.contiguous(), depth.contiguous(), poses, intrinsics)
 
 
-def _finish(views: _Crop, valid: Tensor, cut: tuple[float, float], layout: Layout, rng: Generator) -> Sample:
+def _finish(views: _Crop, valid: Tensor, cut: tuple[float, float], sources: int, rng: Generator) -> Sample:
     """Draws the unit of length, the range of the planes, pose noise, sources and colours of a sample.
 
     The range contains the true one, except in some samples whose planes end at a depth quantile within ``cut``.
@@ -241,9 +224,9 @@ def _finish(views: _Crop, valid: Tensor, cut: tuple[float, float], layout: Layou
         poses = rigid_motions(turns, shifts) @ poses
     depth_range, size = torch.tensor([near, far]), (depth.shape[-2], depth.shape[-1])
     noise = torch.from_numpy(rng.normal(0, _SOURCE_NOISE, (len(poses), len(poses)))).float()
-    sources = choose_sources(poses, views.intrinsics, size, depth_range, layout.sources, noise)
+    chosen = choose_sources(poses, views.intrinsics, size, depth_range, sources, noise)
     look = recolour(views.images, rng)
-    return Sample(look, depth, poses, views.intrinsics, depth_range.expand(len(poses), 2), sources, layout.planes)
+    return Sample(look, depth, poses, views.intrinsics, depth_range.expand(len(poses), 2), chosen)
 
 
 def recolour(images: Tensor, rng: Generator) -> Tensor:
@@ -266,7 +249,8 @@ def recolour(images: Tensor, rng: Generator) -> Tensor:
         images = images * torch.from_numpy(exposure).float()
         images = images + torch.from_numpy(rng.normal(0, 0.015, (views, 1, 1, 1))).float()
     if rng.random() < 0.35:
-        blurred = _blur(images, rng.uniform(0.4, 1.1))
+        deviation = rng.uniform(0.4, 1.1)
+        blurred = gaussian_blur2d(images, 5, (deviation, deviation), separable=False)
         chosen = torch.from_numpy(rng.random(views) < rng.uniform(0.3, 1.0))
         images = torch.where(chosen[:, None, None, None], blurred, images)
     if rng.random() < 0.7:
@@ -275,11 +259,3 @@ def recolour(images: Tensor, rng: Generator) -> Tensor:
             noise = 2 * F.avg_pool2d(noise, 3, 1, 1)
         images = images + noise
     return images.clamp(0, 1)
-
-
-def _blur(images: Tensor, deviation: float) -> Tensor:
-    steps = torch.arange(-2, 3).float()
-    kernel = torch.exp(-steps.square() / (2 * deviation**2))
-    kernel = kernel / kernel.sum()
-    padded = F.pad(images.flatten(0, 1)[:, None], (2, 2, 2, 2), mode="reflect")
-    return F.conv2d(padded, (kernel[:, None] * kernel)[None, None]).view_as(images)

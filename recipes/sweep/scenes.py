@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -22,10 +19,8 @@ from vg2gt.data.sources.infinigen import Infinigen
 from vg2gt.data.synthetic.synthetic_scene import LOBES, SyntheticScene
 from vg2gt.geometry.cameras import rigid_motions
 from vg2gt.io.arrays import read_npz
-from vg2gt.io.files import write_cached
+from vg2gt.io.files import write_bytes
 
-FIRST_SEED = 5_000_000  # disjoint from the seeds for training (from 0) and evaluating (from 1,000,000) VG²GT
-SIZE = (144, 288)
 FRAMES = 14
 _STREAM = 77  # separates the random stream of the cameras from that of the scene
 _KINDS = ("room", "object", "room", "wide", "object", "room", "landmark", "object", "wide", "outdoor")  # in turn
@@ -50,19 +45,38 @@ class SceneFrames(NamedTuple):
     intrinsics: Tensor
 
 
+def scene_files(folder: str | os.PathLike[str], count: int, first_seed: int, size: tuple[int, int]) -> list[Path]:
+    """Returns the files of procedural scenes in a folder, which :func:`read_scene` renders when they are first read.
+
+    Args:
+        folder: folder of the scenes.
+        count: number of scenes.
+        first_seed: seed of the first scene; the others have consecutive seeds.
+        size: height and width of the frames.
+    """
+    root = Path(folder).expanduser()
+    return [root / f"{seed:08d}-{size[0]}x{size[1]}.npz" for seed in range(first_seed, first_seed + count)]
+
+
 def is_room(path: Path) -> bool:
-    """Returns whether a cached scene is a room."""
+    """Returns whether a scene is a room."""
     first = path.stem.split("-")[0]
     return first == "infinigen" or _KINDS[int(first) % len(_KINDS)] in ("room", "wide")
 
 
 def read_scene(path: Path) -> SceneFrames:
-    """Reads a cached scene."""
-    arrays = read_npz(path, SceneFrames._fields)
+    """Reads the frames of a scene; renders a procedural one that is missing, and keeps it."""
+    if path.is_file():
+        arrays = read_npz(path, SceneFrames._fields)
+    else:
+        seed, size = path.stem.split("-")
+        height, width = size.split("x")
+        arrays = render_scene(int(seed), (int(height), int(width)))
+        _write(path, arrays)
     return SceneFrames(*(torch.from_numpy(arrays[name]) for name in SceneFrames._fields))
 
 
-def render_scene(seed: int, size: tuple[int, int] = SIZE) -> dict[str, NDArray]:
+def render_scene(seed: int, size: tuple[int, int]) -> dict[str, NDArray[Any]]:
     """Renders a training scene; the seed determines its kind.
 
     The scene is one of :mod:`examples.worlds`. Focal length, roll, camera shake, highlights and photographic flaws are
@@ -91,13 +105,8 @@ def render_scene(seed: int, size: tuple[int, int] = SIZE) -> dict[str, NDArray]:
     if rng.random() < 0.67:
         scene.develop = partial(photograph.develop, seed)
     rendered = scene.render(frames.tolist(), 1, samples=1)
-    depth = np.stack([frame.depth for frame in rendered])
-    return {
-        "images": np.stack([frame.image for frame in rendered]),
-        "depth": np.where(depth > 0, depth, np.inf).astype(np.float16),
-        "world_to_camera": scene.world_to_camera[frames].astype(np.float32),
-        "intrinsics": np.tile(scene.intrinsics.astype(np.float32), (FRAMES, 1, 1)),
-    }
+    images, depth = (np.stack([getattr(frame, name) for frame in rendered]) for name in ("image", "depth"))
+    return _arrays(images, depth, scene.world_to_camera[frames], np.tile(scene.intrinsics, (FRAMES, 1, 1)))
 
 
 def _shake(scene: SyntheticScene, rng: np.random.Generator, metres: float) -> NDArray[np.float64]:
@@ -108,40 +117,6 @@ def _shake(scene: SyntheticScene, rng: np.random.Generator, metres: float) -> ND
     shifts = rng.normal(0, metres, (count, 3))
     motion = rigid_motions(torch.from_numpy(turns), torch.from_numpy(shifts)).numpy()
     return np.asarray(motion @ scene.world_to_camera, np.float64)
-
-
-def make_scenes(
-    folder: str | os.PathLike[str],
-    count: int,
-    first_seed: int = FIRST_SEED,
-    size: tuple[int, int] = SIZE,
-    workers: int = 1,
-) -> Iterator[Path]:
-    """Renders scenes into a folder, unless they exist; yields the file of each.
-
-    Args:
-        folder: output folder, created if needed.
-        count: number of scenes.
-        first_seed: seed of the first scene; the others have consecutive seeds.
-        size: height and width of the frames.
-        workers: number of processes that render; 1 renders in this process.
-    """
-    root = Path(folder).expanduser()
-    seeds = range(first_seed, first_seed + count)
-    make = partial(_make_scene, root, (size[0], size[1]))
-    if workers == 1:
-        yield from map(make, seeds)
-        return
-    yield make(first_seed)  # compiles the kernels, which the workers then load from the cache
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        yield from pool.map(make, seeds[1:], chunksize=4)
-
-
-def _make_scene(root: Path, size: tuple[int, int], seed: int) -> Path:
-    path = root / f"{seed:08d}-{size[0]}x{size[1]}.npz"
-    if not path.is_file():
-        _write(path, render_scene(seed, size), root)
-    return path
 
 
 def read_infinigen(folder: str | os.PathLike[str], cache: str | os.PathLike[str]) -> list[Path]:
@@ -155,19 +130,23 @@ def read_infinigen(folder: str | os.PathLike[str], cache: str | os.PathLike[str]
         path = root / f"infinigen-{scene.replace('/', '-')}.npz"
         if not path.is_file():
             frames = source.load(scene, source.frames(scene))
-            depth = frames.depth.numpy()
-            arrays = {
-                "images": (frames.images.permute(0, 2, 3, 1) * 255).round().byte().numpy(),
-                "depth": np.where(depth > 0, depth, np.inf).astype(np.float16),
-                "world_to_camera": frames.world_to_camera.numpy().astype(np.float32),
-                "intrinsics": frames.intrinsics.numpy().astype(np.float32),
-            }
-            _write(path, arrays, root)
+            pixels = (frames.images.permute(0, 2, 3, 1) * 255).round().byte()
+            cameras = (frames.world_to_camera.numpy(), frames.intrinsics.numpy())
+            _write(path, _arrays(pixels.numpy(), frames.depth.numpy(), *cameras))
         paths.append(path)
     return paths
 
 
-def _write(path: Path, arrays: dict[str, NDArray], root: Path) -> None:
+def _arrays(
+    images: NDArray[np.uint8], depth: NDArray[Any], poses: NDArray[Any], intrinsics: NDArray[Any]
+) -> dict[str, NDArray[Any]]:
+    """The fields of :class:`SceneFrames`; where depth is 0, there is sky."""
+    sky = np.where(depth > 0, depth, np.inf).astype(np.float16)
+    values = (images, sky, poses.astype(np.float32), intrinsics.astype(np.float32))
+    return dict(zip(SceneFrames._fields, values, strict=True))
+
+
+def _write(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)  # pyright: ignore[reportArgumentType]
-    write_cached(path, buffer.getvalue(), root)
+    write_bytes(path, buffer.getvalue())

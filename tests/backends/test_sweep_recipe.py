@@ -15,7 +15,7 @@ from backends.sweep.network import PosedViews, Sweep, SweepEncoding
 from backends.sweep.volume import from_inverse
 from recipes.sweep.objective import cell_inverse, objective
 from recipes.sweep.samples import Sample, TrainingSamples
-from recipes.sweep.scenes import make_scenes, read_infinigen, read_scene
+from recipes.sweep.scenes import read_infinigen, read_scene, scene_files
 from tests.commands import ROOT
 from tests.data.sources import layout_infinigen
 from tests.data.sources.layouts import room
@@ -25,18 +25,18 @@ from vg2gt.types import Cameras
 
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    return list(make_scenes(tmp_path_factory.mktemp("scenes"), 4))  # two rooms, an object, a room from all around
+    """Two rooms, an object, a room from all around; rendered when they are first read."""
+    return scene_files(tmp_path_factory.mktemp("scenes"), 4, 5_000_000, (144, 288))
 
 
-def test_scenes_are_made_once_and_the_same_by_several_processes(scenes: list[Path], tmp_path: Path) -> None:
-    before = [path.stat().st_mtime_ns for path in scenes]
-    assert list(make_scenes(scenes[0].parent, 4)) == scenes
-    assert [path.stat().st_mtime_ns for path in scenes] == before
-    made = list(make_scenes(tmp_path, 3, size=(48, 96), workers=2))
-    alone = list(make_scenes(tmp_path / "alone", 3, size=(48, 96)))
-    assert [path.name for path in made] == [path.name for path in alone]
-    for path, other in zip(made, alone, strict=True):
-        assert all(torch.equal(a, b) for a, b in zip(read_scene(path), read_scene(other), strict=True))
+def test_scenes_are_rendered_once(tmp_path: Path) -> None:
+    (path,) = scene_files(tmp_path, 1, 5_000_001, (48, 96))
+    made = read_scene(path)
+    assert made.images.shape == (14, 48, 96, 3)
+    written = path.stat().st_mtime_ns
+    for kept in (read_scene(path), read_scene(*scene_files(tmp_path / "other", 1, 5_000_001, (48, 96)))):
+        assert all(torch.equal(a, b) for a, b in zip(made, kept, strict=True))
+    assert path.stat().st_mtime_ns == written
 
 
 def test_views_of_a_sample_see_the_same_points(scenes: list[Path]) -> None:

@@ -2,7 +2,6 @@
 
 import importlib.util
 import os
-from types import ModuleType
 
 import pytest
 
@@ -10,6 +9,8 @@ if importlib.util.find_spec("triton") is None:
     pytest.skip("needs triton, which has wheels for Linux on x86-64 only", allow_module_level=True)
 if os.environ.get("TRITON_INTERPRET") == "1":
     pytest.skip("the interpreter's kernels cannot be compiled", allow_module_level=True)
+
+from tests.rendering.kernel_launches import compile_for, variants
 
 NVIDIA = ("sm_80", "sm_90", "sm_100")
 # The most registers a thread may take, over all targets. 1-warp programs of up to 64 registers fill all 32 places of a
@@ -26,11 +27,6 @@ SHORT = (
 )
 
 
-@pytest.fixture
-def bench(benchmark_script) -> ModuleType:
-    return benchmark_script("gpu_kernels")
-
-
 def hold(found: list) -> None:
     for row in found:
         print(row)
@@ -39,20 +35,20 @@ def hold(found: list) -> None:
     assert not [row for row in found if row.shared > 1024]
 
 
-def test_the_main_kernels_compile_for_a_gpu_that_is_not_there(bench: ModuleType) -> None:
-    launches = bench.variants()
-    hold([bench.compile_for(launches[name], "sm_90") for name in SHORT])
+def test_the_main_kernels_compile_for_a_gpu_that_is_not_there() -> None:
+    launches = variants()
+    hold([compile_for(launches[name], "sm_90") for name in SHORT])
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("target", NVIDIA)
-def test_all_variants_compile_for_three_generations(target: str, bench: ModuleType) -> None:
-    launches = bench.variants()
+def test_all_variants_compile_for_three_generations(target: str) -> None:
+    launches = variants()
     assert {name.split()[0] for name in launches} == set(REGISTERS)
-    hold([bench.compile_for(launch, target) for launch in launches.values()])
+    hold([compile_for(launch, target) for launch in launches.values()])
 
 
 @pytest.mark.slow
-def test_all_variants_compile_for_amd(bench: ModuleType) -> None:
-    rows = [bench.compile_for(launch, "gfx942") for launch in bench.variants().values()]
+def test_all_variants_compile_for_amd() -> None:
+    rows = [compile_for(launch, "gfx942") for launch in variants().values()]
     assert all(row.spills == 0 and 0 < row.registers <= 256 for row in rows), rows
