@@ -27,7 +27,6 @@ class Backend(nn.Module, ABC):
         token_dims: channels of the patch tokens, one entry per tapped layer, in tap order.
         licence: licence of the weights, printed when they are loaded.
         is_metric: True if ``Geometry.scale`` turns the decoded depth into metres.
-        supports_gradient: True if ``decode`` is differentiable with respect to ``tokens.patch``.
         needs_hints: True if ``encode`` requires hints, at least cameras.
         min_views: minimum number of views; ``encode`` raises ValueError for fewer.
         predicts_cameras: False if its cameras are those of the hints.
@@ -50,7 +49,6 @@ class Backend(nn.Module, ABC):
         token_dims: tuple[int, ...],
         licence: str,
         is_metric: bool = False,
-        supports_gradient: bool = True,
         needs_hints: bool = False,
         min_views: int = 1,
         predicts_cameras: bool = True,
@@ -61,7 +59,6 @@ class Backend(nn.Module, ABC):
         self.token_dims = tuple(token_dims)
         self.licence = licence
         self.is_metric = is_metric
-        self.supports_gradient = supports_gradient
         self.needs_hints = needs_hints
         self.min_views = min_views
         self.predicts_cameras = predicts_cameras
@@ -90,8 +87,7 @@ class Backend(nn.Module, ABC):
             tokens: output of ``encode``, whose patch tokens may be modified.
 
         Returns:
-            Depth, confidence and raw cameras. With ``supports_gradient``, depth and confidence are differentiable with
-            respect to ``tokens.patch``.
+            Depth, confidence and raw cameras; depth and confidence are differentiable with respect to ``tokens.patch``.
         """
 
     def decode_cameras(self, tokens: Tokens) -> Cameras:

@@ -9,10 +9,10 @@ import importlib.util
 import os
 import tempfile
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 import onnxruntime
 import torch
@@ -29,7 +29,6 @@ from vg2gt.io.tensors import read_tensors
 from vg2gt.types import Cameras, Geometry, Hints, Tokens
 
 Exportable = VGGTBackend | DA3Backend
-Provider = Literal["auto", "cpu", "cuda"]
 
 DESCRIPTION = "backend.json"
 ENCODER, DECODER, DECODER_WEIGHTS = "encoder.onnx", "decoder.onnx", "decoder.safetensors"
@@ -68,36 +67,36 @@ class Description:
 
 
 class Graph(nn.Module):
-    """Part of a backend as a function of tensors, for export."""
+    """Part of a backend as a function of tensors, for export: :func:`encode_tensors` or :func:`decode_tensors`."""
 
-    def __init__(self, backend: Exportable) -> None:
+    def __init__(self, backend: Exportable, function: Callable[..., tuple[Tensor, ...]]) -> None:
         super().__init__()
-        self.backend = backend
-
-
-class EncoderGraph(Graph):
-    """Images, and cameras if used, to patch tokens ``[B, V, h, w, D]`` and a camera token."""
+        self.backend, self.function = backend, function
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
-        """Encodes ``[B, V, 3, H, W]`` images; world-to-camera matrices and intrinsics follow if they are used."""
-        images, *cameras = inputs
-        size = (images.shape[-2], images.shape[-1])
-        hints = Hints(cameras=Cameras(cameras[0], cameras[1], size)) if cameras else None
-        tokens = self.backend.encode_checked(images, hints)
-        return (*(tap.unflatten(2, tokens.grid) for tap in tokens.patch), tokens.camera)
+        """Applies the function."""
+        return self.function(self.backend, *inputs)
 
 
-class DecoderGraph(Graph):
-    """Patch tokens ``[B, V, h, w, D]`` and a camera token to depth, confidence and cameras."""
+def encode_tensors(backend: Exportable, images: Tensor, *cameras: Tensor) -> tuple[Tensor, ...]:
+    """Encodes ``[B, V, 3, H, W]`` images; world-to-camera matrices and intrinsics follow if they are used.
 
-    def forward(self, *tokens: Tensor) -> tuple[Tensor, ...]:
-        """Decodes all views at once; the camera token is the last argument."""
-        *patch, camera = tokens
-        grid = (patch[0].shape[2], patch[0].shape[3])
-        size = (grid[0] * self.backend.patch_size, grid[1] * self.backend.patch_size)
-        flat = tuple(tap.flatten(2, 3) for tap in patch)
-        geometry = self.backend.network.decode(Tokens(flat, camera, grid, size), None)
-        return geometry.depth, geometry.depth_conf, geometry.cameras.world_to_camera, geometry.cameras.intrinsics
+    Returns:
+        Patch tokens ``[B, V, h, w, D]`` of every tap, and the camera token.
+    """
+    hints = Hints(cameras=Cameras(cameras[0], cameras[1], (images.shape[-2], images.shape[-1]))) if cameras else None
+    tokens = backend.encode_checked(images, hints)
+    return (*(tap.unflatten(2, tokens.grid) for tap in tokens.patch), tokens.camera)
+
+
+def decode_tensors(backend: Exportable, *tokens: Tensor) -> tuple[Tensor, ...]:
+    """Decodes the results of :func:`encode_tensors`, all views at once, to depth, confidence, poses and intrinsics."""
+    *patch, camera = tokens
+    grid = (patch[0].shape[2], patch[0].shape[3])
+    size = (grid[0] * backend.patch_size, grid[1] * backend.patch_size)
+    flat = tuple(tap.flatten(2, 3) for tap in patch)
+    geometry = backend.network.decode(Tokens(flat, camera, grid, size), None)
+    return geometry.depth, geometry.depth_conf, geometry.cameras.world_to_camera, geometry.cameras.intrinsics
 
 
 def export(backend: Backend, out: Path) -> Description:
@@ -153,7 +152,7 @@ def _write(backend: Exportable, folder: Path) -> Description:
 
 def _export_graphs(backend: Exportable, folder: Path) -> dict[str, float]:
     """Writes both graphs; returns their largest :func:`relative_difference` to torch, at sizes not traced."""
-    encoder, decoder = EncoderGraph(backend).eval(), DecoderGraph(backend).eval()
+    encoder, decoder = (Graph(backend, function).eval() for function in (encode_tensors, decode_tensors))
     tokens = token_names(len(backend.token_dims))
     names = ["images", "world_to_camera", "intrinsics"][: 3 if backend.needs_hints else 1]
     worst = {"encoder": 0.0, "decoder": 0.0}
@@ -161,7 +160,7 @@ def _export_graphs(backend: Exportable, folder: Path) -> dict[str, float]:
         inputs = example_inputs(backend, *TRACED)
         export_graph(encoder, inputs, names, tokens, folder / ENCODER)
         export_graph(decoder, encoder(*inputs), tokens, DECODED, folder / DECODER)
-        sessions = [open_session(folder / file, "cpu") for file in (ENCODER, DECODER)]
+        sessions = [open_session(folder / file) for file in (ENCODER, DECODER)]
         for shape in CHECKED:
             inputs = example_inputs(backend, *shape)
             encoded = encoder(*inputs)
@@ -240,43 +239,29 @@ def relative_difference(found: Tensor, expected: Tensor) -> float:
 class OnnxBackend(Backend):
     """Network exported by ``vg2gt export``.
 
-    Name, licence and identity are those of the exported network, so both accept the same checkpoints. If the folder has
-    no ``decoder.safetensors``, ``decode`` runs ``decoder.onnx`` and is not differentiable.
+    Name, licence and identity are those of the exported network, so both accept the same checkpoints. The encoder runs
+    on the GPU if onnxruntime has the CUDA provider.
 
     Args:
         path: folder of the bundle.
-        provider: where to run the encoder; ``auto`` uses the GPU if onnxruntime has the CUDA provider.
-        head_chunk: maximum number of views that the torch decoder decodes at a time; None decodes all at once.
+        head_chunk: maximum number of views that the decoder decodes at a time; None decodes all at once.
 
     Raises:
         FileNotFoundError: if ``path`` is not a bundle or lacks a file.
-        ValueError: if a file is damaged or does not fit, or the provider is unknown.
-        RuntimeError: if the provider is not available.
+        ValueError: if a file is damaged or does not fit.
     """
 
-    def __init__(self, path: str | None = None, provider: Provider = "auto", head_chunk: int | None = 8) -> None:
+    def __init__(self, path: str | None = None, head_chunk: int | None = 8) -> None:
         if path is None:
             raise ValueError(f"backend=onnx needs backend.path=FOLDER: {REMEDY}")
-        if provider not in get_args(Provider):
-            raise ValueError(f"backend.provider is {provider!r}; choose one of {', '.join(get_args(Provider))}")
         folder = Path(path).expanduser()
-        description = read_description(folder)
-        decoder = load_decoder(folder, description.decoder)
-        super().__init__(
-            description.name,
-            description.patch_size,
-            tuple(description.token_dims),
-            description.licence,
-            supports_gradient=decoder is not None,
-            needs_hints=description.needs_hints,
-        )
-        self._identity = {"name": description.name, "weights": description.weights}
+        found = read_description(folder)
+        dims = tuple(found.token_dims)
+        super().__init__(found.name, found.patch_size, dims, found.licence, needs_hints=found.needs_hints)
+        self._identity = {"name": found.name, "weights": found.weights}
         self.head_chunk = head_chunk
-        self.decoder = decoder
-        self.encoder_session = open_session(folder / ENCODER, provider)
-        self.decoder_session = open_session(folder / DECODER, provider) if decoder is None else None
-        if decoder is None:
-            warnings.warn(f"{folder} has no {DECODER_WEIGHTS}: {self.name} decodes without gradient", stacklevel=2)
+        self.encoder_session = open_session(folder / ENCODER)
+        self.decoder = load_decoder(folder, found.decoder)
         print(f"{self.name}: ONNX bundle {folder}, licence: {self.licence}")
         self.freeze()
 
@@ -294,18 +279,11 @@ class OnnxBackend(Backend):
 
     def decode(self, tokens: Tokens) -> Geometry:
         """See :meth:`Backend.decode`."""
-        if self.decoder is not None:
-            return self.decoder.decode(tokens, self.head_chunk)
-        assert self.decoder_session is not None
-        values = (*(tap.unflatten(2, tokens.grid) for tap in tokens.patch), tokens.camera)
-        inputs = dict(zip(token_names(len(tokens.patch)), values, strict=True))
-        depth, confidence, world_to_camera, intrinsics = run_session(self.decoder_session, inputs, DECODED)
-        cameras = Cameras(world_to_camera, intrinsics, tokens.size)
-        return Geometry(depth, confidence, cameras, torch.ones_like(depth[:, 0, 0, 0]))
+        return self.decoder.decode(tokens, self.head_chunk)
 
     def decode_cameras(self, tokens: Tokens) -> Cameras:
         """See :meth:`Backend.decode_cameras`."""
-        return super().decode_cameras(tokens) if self.decoder is None else self.decoder.decode_cameras(tokens)
+        return self.decoder.decode_cameras(tokens)
 
 
 def token_names(taps: int) -> list[str]:
@@ -314,13 +292,13 @@ def token_names(taps: int) -> list[str]:
 
 
 def read_description(folder: Path) -> Description:
-    """Reads the description of a bundle; only the decoder's weights may be missing from the folder.
+    """Reads the description of a bundle.
 
     Raises:
-        FileNotFoundError: if another file is missing.
+        FileNotFoundError: if one of the files that :class:`OnnxBackend` reads is missing.
         ValueError: if the description is not valid.
     """
-    for name in (DESCRIPTION, ENCODER, DECODER):
+    for name in (DESCRIPTION, ENCODER, DECODER_WEIGHTS):
         if not (folder / name).is_file():
             raise FileNotFoundError(f"{folder} is not an ONNX bundle, {name} is missing: copy all of it, or {REMEDY}")
     try:
@@ -330,45 +308,38 @@ def read_description(folder: Path) -> Description:
         raise ValueError(f"{folder / DESCRIPTION} does not describe a bundle ({error!r}): {REMEDY}") from error
 
 
-def load_decoder(folder: Path, decoder: Mapping[str, Any]) -> VGGTDecoder | DA3Decoder | None:
-    """Rebuilds the decoder of a bundle from its ``class`` and ``arguments``; returns None if there are no weights.
+def load_decoder(folder: Path, decoder: Mapping[str, Any]) -> VGGTDecoder | DA3Decoder:
+    """Rebuilds the decoder of a bundle from its ``class`` and ``arguments``.
 
     Raises:
         ValueError: if the class is not one of :data:`DECODERS`, or the arguments or weights do not fit.
     """
-    file = folder / DECODER_WEIGHTS
-    if not file.is_file():
-        return None
     try:
         with torch.device("meta"):
             module = DECODERS[decoder["class"]](**decoder["arguments"])
     except (KeyError, RuntimeError, TypeError, ValueError) as error:
-        raise ValueError(
-            f"{folder / DESCRIPTION} does not describe a {' or '.join(DECODERS)} ({error!r}): {REMEDY}, or remove "
-            f"{DECODER_WEIGHTS} to decode without gradient"
-        ) from error
-    load_strictly(module, read_tensors(file), "", (), str(file))
+        known = " or ".join(DECODERS)
+        raise ValueError(f"{folder / DESCRIPTION} does not describe a {known} ({error!r}): {REMEDY}") from error
+    load_strictly(module, read_tensors(folder / DECODER_WEIGHTS), "", (), str(folder / DECODER_WEIGHTS))
     return module
 
 
-def open_session(file: Path, provider: Provider) -> onnxruntime.InferenceSession:
-    """Opens an ONNX file on this process's GPU or the CPU, with torch's number of threads; errors as OnnxBackend's."""
+def open_session(file: Path) -> onnxruntime.InferenceSession:
+    """Opens an ONNX file on this process's GPU if onnxruntime can use it, else on the CPU with torch's threads.
+
+    Raises:
+        ValueError: if onnxruntime cannot open the file.
+    """
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = torch.get_num_threads()
     providers: list[str | tuple[str, dict[str, str]]] = ["CPUExecutionProvider"]
-    if provider != "cpu" and CUDA in onnxruntime.get_available_providers():
+    if CUDA in onnxruntime.get_available_providers():
         # Plain float32 as in torch, not TF32. In distributed training, every process has its own GPU.
         providers.insert(0, (CUDA, {"device_id": os.environ.get("LOCAL_RANK", "0"), "use_tf32": "0"}))
     try:
-        session = onnxruntime.InferenceSession(str(file), options, providers=providers)
+        return onnxruntime.InferenceSession(str(file), options, providers=providers)
     except Exception as error:  # onnxruntime's own classes have no common base
         raise ValueError(f"onnxruntime {onnxruntime.__version__} cannot open {file} ({error}): {REMEDY}") from error
-    if provider == "cuda" and CUDA not in session.get_providers():
-        raise RuntimeError(
-            f"backend.provider=cuda, but onnxruntime only has {', '.join(session.get_providers())}: install "
-            "onnxruntime-gpu in place of onnxruntime, or use backend.provider=cpu"
-        )
-    return session
 
 
 def run_session(

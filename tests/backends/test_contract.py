@@ -124,8 +124,6 @@ def test_decoding_again_is_bit_equal_and_cameras_ignore_patches(backend, tokens,
 
 
 def test_gradient_reaches_the_tokens(backend: Backend, tokens: Tokens) -> None:
-    if not backend.supports_gradient:
-        pytest.skip("this backend decodes without gradient")
     patch = tuple(patch.detach().clone().requires_grad_() for patch in tokens.patch)
     depth = backend.decode(tokens.with_patch(patch)).depth
     weight = torch.linspace(0, 1, depth.numel()).view_as(depth)

@@ -19,8 +19,8 @@ import torch
 from numpy.typing import NDArray
 
 from vg2gt.io.errors import FormatError
-from vg2gt.io.files import write_json
-from vg2gt.io.json_checks import Fields, check_rigid, load_json
+from vg2gt.io.files import read_json, write_json
+from vg2gt.io.json_checks import Fields, check_rigid
 from vg2gt.types import Cameras
 
 MOST_PIXELS = 1 << 28  # per image to render; the largest photographs have fewer
@@ -140,7 +140,7 @@ def read_cameras_json(path: str | Path) -> list[NamedCamera]:
         FormatError: if the file is not JSON or a field is wrong, naming the file, the entry and the field.
     """
     path = Path(path)
-    content = load_json(path)
+    content = read_json(path)
     if not isinstance(content, list):
         raise FormatError(f"{path}: expected a list of cameras, got {type(content).__name__}")
     return [_camera(f"{path}: [{index}]", entry) for index, entry in enumerate(content)]
@@ -158,10 +158,8 @@ def _camera(place: str, entry: Any) -> NamedCamera:
     photo = entry.get("photo")
     if photo is not None:
         inside = Fields(f"{place}.photo.", photo)
-        names = [inside.get(key, str, "a text") for key in ("name", "lens")]
-        if None in names:
-            raise inside.wrong("name" if names[0] is None else "lens", "a text")
-        photo = Photo(names[0], *_optics(inside), names[1])
+        title, lens = (inside.get(key, str, "a text", required=True) for key in ("name", "lens"))
+        photo = Photo(title, *_optics(inside), lens)
     similarity = None if entry.get("similarity") is None else _matrix(fields, "similarity", 4)
     metres = fields.number("metres_per_unit", 0, 1e30)
     return NamedCamera(name, width, height, intrinsics, pose, photo, similarity, metres)
@@ -176,9 +174,7 @@ def _optics(fields: Fields) -> tuple[int, int, NDArray[np.float64]]:
             f"{fields.place}intrinsics is {intrinsics.tolist()}, expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with "
             "positive focal lengths and no skew; undistort the images"
         )
-    width, height = fields.pixels("width"), fields.pixels("height")
-    if width is None or height is None:
-        raise fields.wrong("width" if width is None else "height", "a whole number of pixels")
+    width, height = (fields.pixels(name, required=True) or 0 for name in ("width", "height"))
     if width * height > MOST_PIXELS:
         raise FormatError(f"{fields.place[:-1]} has {width}x{height} pixels, more than {MOST_PIXELS} in all")
     return width, height, intrinsics

@@ -2,27 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vg2gt.io.errors import FormatError
-from vg2gt.io.files import read_json
 
 MAX_SIZE = 1 << 20  # pixels along an image's side
-
-
-def load_json(path: Path, content: bytes | None = None) -> Any:
-    """Parses a JSON file, or its ``content`` if it was read already."""
-    try:
-        return read_json(path) if content is None else json.loads(content)
-    except (ValueError, RecursionError) as error:
-        raise FormatError(f"{path}: not valid JSON ({error}); the file is truncated or damaged") from error
 
 
 class Fields:
@@ -42,10 +31,10 @@ class Fields:
         """Returns the error for a field that is missing or not as expected."""
         return FormatError(f"{self.place}{name} is {short(self.content.get(name))}, expected {expected}")
 
-    def get(self, name: str, kind: type, expected: str) -> Any:
-        """Returns a field of type ``kind``; None if it is missing."""
+    def get(self, name: str, kind: type, expected: str, required: bool = False) -> Any:
+        """Returns a field of type ``kind``; None if it is missing and not ``required``."""
         value = self.content.get(name)
-        if value is not None and not isinstance(value, kind):
+        if not isinstance(value, kind) and (required or value is not None):
             raise self.wrong(name, expected)
         return value
 
@@ -59,12 +48,14 @@ class Fields:
             raise self.wrong(name, f"a finite number{limits}")
         return float(value)
 
-    def pixels(self, name: str) -> int | None:
-        """Returns a whole number of pixels; None if it is missing."""
+    def pixels(self, name: str, required: bool = False) -> int | None:
+        """Returns a whole number of pixels; None if it is missing and not ``required``."""
         value = self.number(name, 0, MAX_SIZE)
-        if value is not None and value != round(value):
+        if value is None and not required:
+            return None
+        if value is None or value != round(value):
             raise self.wrong(name, "a whole number of pixels")
-        return None if value is None else round(value)
+        return round(value)
 
     def matrix(self, name: str, rows: Sequence[int], columns: int) -> NDArray[np.float64]:
         """Returns a matrix whose number of rows is one of ``rows``; its values may be NaN or infinite."""

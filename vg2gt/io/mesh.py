@@ -17,7 +17,6 @@ from torch import Tensor
 from vg2gt.geometry.cameras import ray_directions, unproject
 from vg2gt.geometry.normals import normals_from_depth
 from vg2gt.io.files import write_bytes
-from vg2gt.io.points import TO_GLTF
 from vg2gt.types import Cameras
 
 SUFFIXES = (".ply", ".glb", ".obj")
@@ -107,7 +106,7 @@ def write_mesh(path: str | Path, mesh: Mesh) -> Path:
         raise ValueError("the mesh is empty: no valid depth, or voxels larger than the surfaces; check both")
     body = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.colors, process=False)
     if path.suffix.lower() == ".glb":
-        body.apply_transform(TO_GLTF)
+        body.apply_transform(np.diag([1.0, -1.0, -1.0, 1.0]))  # glTF has y up, our world has y down
     content = body.export(file_type=path.suffix[1:].lower())
     assert not isinstance(content, dict)  # only formats with several files give a dict
     return write_bytes(path, content.encode() if isinstance(content, str) else content)

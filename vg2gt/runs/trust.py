@@ -29,6 +29,9 @@ OWN = ("vg2gt", "backends")
 KINDS = (nn.Module, SceneSource, SceneScale, ViewCheck, Renderer)
 """Classes of this project that a run's file may name, besides data modules; their constructors at most read files."""
 
+GONE = ("drift", "provider")
+"""Options of backends in runs of former versions, which no network depends on."""
+
 
 class UntrustedError(ValueError):
     """An untrusted file asks for more than data."""
@@ -58,6 +61,8 @@ def parse_run_config(text: str, source: str | Path) -> DictConfig:
         raise ValueError(f"{source} is not a run's configuration: {' '.join(str(error).split())}") from error
     if not isinstance(content, dict):
         raise ValueError(f"{source} is not a run's configuration: expected a mapping")
+    if isinstance(backend := content.get("backend"), dict):
+        content["backend"] = {key: value for key, value in backend.items() if key not in GONE}
     return OmegaConf.create(content)
 
 

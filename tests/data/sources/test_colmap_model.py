@@ -122,16 +122,6 @@ def test_an_exif_orientation_that_fits_no_camera_is_named(tmp_path):
         COLMAP(str(tmp_path)).scene_index("statue")
 
 
-def test_values_that_are_not_finite_leave_their_image_out_by_name(tmp_path, caplog):
-    """Item 21."""
-    write(tmp_path, room(4), text=True)
-    path = tmp_path / "statue" / "sparse" / "0" / "cameras.txt"
-    *before, last = path.read_text().splitlines()
-    path.write_text("\n".join([*before, " ".join([*last.split()[:4], "-nan(ind)", *last.split()[5:]])]))
-    assert len(COLMAP(str(tmp_path)).frames("statue")) == 3
-    assert "left out images whose camera parameters are not finite: left/" in caplog.text
-
-
 def test_reduced_images_have_reduced_intrinsics(tmp_path):
     frames = room(3)
     write(tmp_path, frames)

@@ -95,16 +95,11 @@ class COLMAP(FileSource):
         masks = find_masks(folder / MASKS, {i: records[i].name for i in color}, f"scene {scene}")
         poses = {i: to_world(colmap_pose(record)) for i, record in enumerate(records)}
         posed = {i: self._posed(scene, where, model, records[i], path, masks.get(i)) for i, path in color.items()}
-        usable = {i: image for i, image in posed.items() if np.isfinite(image.intrinsics).all()}
-        if len(usable) < len(posed):
-            names = ", ".join(records[i].name for i in posed if i not in usable)
-            log.warning("scene %s: left out images whose camera parameters are not finite: %s", scene, names)
-            color = {i: path for i, path in color.items() if i in usable}
         depth = None
         if self.has_depth:
             points = self._scene_points(scene, folder)
             depth = {i: model_folder for i in color if len(points.depth(i))}
-        return make_index(scene, folder, color, depth, poses, {}, posed=usable)
+        return make_index(scene, folder, color, depth, poses, {}, posed=posed)
 
     def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
         """Returns depth at the pixels of the points that a view observes; the nearest point wins a pixel."""
@@ -123,8 +118,6 @@ class COLMAP(FileSource):
         self, scene: str, where: str, model: Reconstruction, record: Image, path: Path, mask: Path | None
     ) -> PosedImage:
         camera = record.camera
-        if not np.any(camera.params):
-            return PosedImage((camera.height, camera.width), np.full((3, 3), np.nan))
         expected = (camera.height, camera.width)
         size, upright = size_on_disk(path, scene, expected, where, partial(_is_stored, model, record, path))
         return posed_image(camera, expected, size, upright, mask, f"{where}, {record.name}")
