@@ -28,7 +28,6 @@ class Backend(nn.Module, ABC):
         licence: licence of the weights, printed when they are loaded.
         is_metric: True if ``Geometry.scale`` turns the decoded depth into metres.
         needs_hints: True if ``encode`` requires hints, at least cameras.
-        min_views: minimum number of views; ``encode`` raises ValueError for fewer.
         predicts_cameras: False if its cameras are those of the hints.
 
     Attributes:
@@ -50,7 +49,6 @@ class Backend(nn.Module, ABC):
         licence: str,
         is_metric: bool = False,
         needs_hints: bool = False,
-        min_views: int = 1,
         predicts_cameras: bool = True,
     ) -> None:
         super().__init__()
@@ -60,7 +58,6 @@ class Backend(nn.Module, ABC):
         self.licence = licence
         self.is_metric = is_metric
         self.needs_hints = needs_hints
-        self.min_views = min_views
         self.predicts_cameras = predicts_cameras
         self._identity: dict[str, str] | None = None
 

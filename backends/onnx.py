@@ -1,16 +1,19 @@
 """ONNX bundles: folders with a frozen network split into encoder and decoder; written by ``vg2gt export``.
 
 The encoder runs in onnxruntime, the decoder is rebuilt as a torch module from its class and arguments.
+
+``backend.json`` holds ``name``, ``licence``, ``patch_size`` and ``token_dims`` of the exported backend, sha256 of its
+``weights`` (checkpoints are matched with it), ``needs_hints`` (whether the encoder also takes ``world_to_camera`` and
+``intrinsics``), ``class`` and ``arguments`` of the ``decoder``, and ``max_difference`` (largest relative difference of
+``encoder`` and ``decoder`` to torch at export).
 """
 
 from __future__ import annotations
 
 import importlib.util
 import os
-import tempfile
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +27,14 @@ from backends.base import Backend
 from backends.da3.backend import DA3Backend, DA3Decoder
 from backends.vggt import VGGTBackend, VGGTDecoder
 from backends.weights import load_strictly
-from vg2gt.io.files import read_json, write_json
+from vg2gt.io.files import read_json, whole_folder, write_json
 from vg2gt.io.tensors import read_tensors
 from vg2gt.types import Cameras, Geometry, Hints, Tokens
 
 Exportable = VGGTBackend | DA3Backend
 
 DESCRIPTION = "backend.json"
+FIELDS = ("name", "licence", "weights", "patch_size", "token_dims", "needs_hints", "decoder")
 ENCODER, DECODER, DECODER_WEIGHTS = "encoder.onnx", "decoder.onnx", "decoder.safetensors"
 REMEDY = "write it with vg2gt export backend=NAME --out FOLDER"
 DECODERS = {kind.__name__: kind for kind in (VGGTDecoder, DA3Decoder)}  # the only classes that are built from a file
@@ -39,31 +43,6 @@ CUDA = "CUDAExecutionProvider"
 TRACED = (2, 3, 4, 6)  # traced scenes, views, patch rows, patch columns: all different, none 1
 CHECKED = ((1, 1, 3, 2), (1, 2, 2, 5), (2, 4, 3, 3))
 TOLERANCE = 1e-3  # relative error; a correct graph differs by about 1e-6, a wrong one by far more than 1e-3
-
-
-@dataclass(frozen=True)
-class Description:
-    """Content of ``backend.json``.
-
-    Attributes:
-        name: name of the exported backend.
-        licence: licence of its weights.
-        weights: sha256 of its weights (``Backend.identity``), which checkpoints are matched with.
-        patch_size: edge of a patch in pixels.
-        token_dims: channels of the patch tokens, in tap order.
-        needs_hints: whether the encoder also takes ``world_to_camera`` and ``intrinsics``.
-        decoder: ``class`` and ``arguments`` to rebuild the decoder.
-        max_difference: largest relative difference to torch at export, of ``encoder`` and ``decoder``.
-    """
-
-    name: str
-    licence: str
-    weights: str
-    patch_size: int
-    token_dims: list[int]
-    needs_hints: bool
-    decoder: dict[str, Any]
-    max_difference: dict[str, float]
 
 
 class Graph(nn.Module):
@@ -99,7 +78,7 @@ def decode_tensors(backend: Exportable, *tokens: Tensor) -> tuple[Tensor, ...]:
     return geometry.depth, geometry.depth_conf, geometry.cameras.world_to_camera, geometry.cameras.intrinsics
 
 
-def export(backend: Backend, out: Path) -> Description:
+def export(backend: Backend, out: Path) -> dict[str, Any]:
     """Exports a bundle, and verifies it against torch at sizes other than the traced one.
 
     Args:
@@ -121,32 +100,22 @@ def export(backend: Backend, out: Path) -> Description:
         raise FileExistsError(f"{out} exists already: remove it or choose another out=FOLDER")
     if not all(importlib.util.find_spec(package) for package in ("onnx", "onnxscript")):
         raise ImportError("export needs onnx and onnxscript: pip install 'vg2gt[export]'")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as temporary:
-        folder = Path(temporary, "bundle")
-        folder.mkdir()
-        description = _write(backend, folder)
-        os.replace(folder, out)
-    return description
-
-
-def _write(backend: Exportable, folder: Path) -> Description:
     kind = "VGGTDecoder" if isinstance(backend, VGGTBackend) else "DA3Decoder"
     with torch.device("meta"):
         names = DECODERS[kind](**backend.network.arguments).state_dict()
     state = backend.network.state_dict()
-    save_file({name: state[name].contiguous() for name in names}, folder / DECODER_WEIGHTS)
-    description = Description(
-        name=backend.name,
-        licence=backend.licence,
-        weights=backend.identity()["weights"],
-        patch_size=backend.patch_size,
-        token_dims=list(backend.token_dims),
-        needs_hints=backend.needs_hints,
-        decoder={"class": kind, "arguments": backend.network.arguments},
-        max_difference=_export_graphs(backend, folder),
-    )
-    write_json(folder / DESCRIPTION, asdict(description))
+    description = {
+        **backend.identity(),
+        "licence": backend.licence,
+        "patch_size": backend.patch_size,
+        "token_dims": list(backend.token_dims),
+        "needs_hints": backend.needs_hints,
+        "decoder": {"class": kind, "arguments": backend.network.arguments},
+    }
+    with whole_folder(out) as folder:
+        save_file({name: state[name].contiguous() for name in names}, folder / DECODER_WEIGHTS)
+        description["max_difference"] = _export_graphs(backend, folder)
+        write_json(folder / DESCRIPTION, description)
     return description
 
 
@@ -256,12 +225,12 @@ class OnnxBackend(Backend):
             raise ValueError(f"backend=onnx needs backend.path=FOLDER: {REMEDY}")
         folder = Path(path).expanduser()
         found = read_description(folder)
-        dims = tuple(found.token_dims)
-        super().__init__(found.name, found.patch_size, dims, found.licence, needs_hints=found.needs_hints)
-        self._identity = {"name": found.name, "weights": found.weights}
+        dims = tuple(found["token_dims"])
+        super().__init__(found["name"], found["patch_size"], dims, found["licence"], needs_hints=found["needs_hints"])
+        self._identity = {"name": found["name"], "weights": found["weights"]}
         self.head_chunk = head_chunk
         self.encoder_session = open_session(folder / ENCODER)
-        self.decoder = load_decoder(folder, found.decoder)
+        self.decoder = load_decoder(folder, found["decoder"])
         print(f"{self.name}: ONNX bundle {folder}, licence: {self.licence}")
         self.freeze()
 
@@ -291,8 +260,8 @@ def token_names(taps: int) -> list[str]:
     return [*(f"patch_{index}" for index in range(taps)), "camera"]
 
 
-def read_description(folder: Path) -> Description:
-    """Reads the description of a bundle.
+def read_description(folder: Path) -> dict[str, Any]:
+    """Reads ``backend.json`` of a bundle.
 
     Raises:
         FileNotFoundError: if one of the files that :class:`OnnxBackend` reads is missing.
@@ -301,11 +270,11 @@ def read_description(folder: Path) -> Description:
     for name in (DESCRIPTION, ENCODER, DECODER_WEIGHTS):
         if not (folder / name).is_file():
             raise FileNotFoundError(f"{folder} is not an ONNX bundle, {name} is missing: copy all of it, or {REMEDY}")
-    try:
-        content = read_json(folder / DESCRIPTION)
-        return Description(**{field.name: content[field.name] for field in fields(Description)})
-    except (ValueError, RecursionError, KeyError, TypeError) as error:
-        raise ValueError(f"{folder / DESCRIPTION} does not describe a bundle ({error!r}): {REMEDY}") from error
+    content = read_json(folder / DESCRIPTION)
+    missing = [name for name in FIELDS if not isinstance(content, dict) or name not in content]
+    if missing:
+        raise ValueError(f"{folder / DESCRIPTION} does not describe a bundle, {missing[0]} is missing: {REMEDY}")
+    return content
 
 
 def load_decoder(folder: Path, decoder: Mapping[str, Any]) -> VGGTDecoder | DA3Decoder:

@@ -16,7 +16,7 @@ from backends.base import seeded_initialisation
 from vg2gt.io.tensors import read_tensors
 
 WEIGHT_FILES = ("model.safetensors", "model.pt")
-SHOWN = 5
+SHOWN = 500  # characters of torch's message, which lists every tensor
 
 Network = TypeVar("Network", bound=nn.Module)
 
@@ -119,21 +119,16 @@ def load_strictly(
         source: name of the file, for messages.
 
     Raises:
-        ValueError: if tensors are missing, misshapen, unexpected or not finite; names the first of them.
+        ValueError: if tensors are missing, misshapen, unexpected or not finite, naming them.
     """
-    wanted = {prefix + key: value for key, value in network.state_dict().items()}
-    complaints = []
-    for key, value in wanted.items():
-        found = state.get(key)
-        if found is None:
-            complaints.append(f"missing {key} {list(value.shape)}")
-        elif found.shape != value.shape:
-            complaints.append(f"{key} is {list(found.shape)}, expected {list(value.shape)}")
-        elif not (found.is_meta or torch.isfinite(found).all()):
-            complaints.append(f"{key} is not finite")
-    complaints += [f"unexpected {key}" for key in state if key not in wanted and not key.startswith(tuple(ignorable))]
-    if complaints:
-        more = f"; and {len(complaints) - SHOWN} more" if len(complaints) > SHOWN else ""
-        raise ValueError(f"{source} does not fit {type(network).__name__}: {'; '.join(complaints[:SHOWN])}{more}")
-    loaded = {key.removeprefix(prefix): state[key].to(value.dtype) for key, value in wanted.items()}
-    network.load_state_dict(loaded, assign=True)
+    wanted = network.state_dict()
+    found = {key: value for key, value in state.items() if not key.startswith(tuple(ignorable))}
+    found |= {prefix + name: state[prefix + name] for name in wanted if prefix + name in state}
+    wrong = [key for key, value in found.items() if not (value.is_meta or torch.isfinite(value).all())]
+    try:
+        if wrong:
+            raise RuntimeError(f"{wrong[0]} is not finite")
+        network.load_state_dict({key.removeprefix(prefix): value.float() for key, value in found.items()}, assign=True)
+    except RuntimeError as error:
+        reason = " ".join(str(error).split())
+        raise ValueError(f"{source} does not fit {type(network).__name__}: {reason[:SHOWN]}") from error

@@ -107,7 +107,7 @@ def metres(cameras: Cameras) -> Tensor:
 
 
 def fill_sky(depth: Tensor, sky: Tensor) -> Tensor:
-    """Sets the depth of sky pixels to the 0.99 quantile of the scene's other pixels.
+    """Sets the depth of sky pixels to the far end of their scene.
 
     Scenes with at most ten sky pixels, or at most ten others, are left unchanged. The published code takes the quantile
     over the whole batch, which is the same for one scene at a time.
@@ -116,12 +116,9 @@ def fill_sky(depth: Tensor, sky: Tensor) -> Tensor:
         depth: ``[B, V, H, W]``.
         sky: sky score ``[B, V, H, W]``; sky from 0.3 on.
     """
-    filled = []
-    for scene, mask in zip(depth, sky >= SKY_THRESHOLD, strict=True):
-        ground = scene[~mask]
-        enough = ground.numel() > MIN_PIXELS and mask.sum() > MIN_PIXELS
-        filled.append(torch.where(mask, quantile(ground, FAR_QUANTILE), scene) if enough else scene)
-    return torch.stack(filled)
+    far, is_sky = far_ends(depth, sky)[:, None, None, None], sky >= SKY_THRESHOLD
+    enough = is_sky.sum((1, 2, 3), keepdim=True) > MIN_PIXELS
+    return torch.where(is_sky & enough & far.isfinite(), far, depth)
 
 
 def quantile(values: Tensor, q: float) -> Tensor:
@@ -157,8 +154,8 @@ class DA3NestedBackend(Backend):
         metric_tokens = self.metric.encode(images, Hints(cameras=geometry.cameras))
         depth, sky = self.metric.decode_raw(metric_tokens)
         scale = fit_scale(depth * metres(geometry.cameras)[..., None, None], sky, geometry)
-        state = {"scale": scale, "sky": sky >= SKY_THRESHOLD, "far": far_ends(geometry.depth, sky, scale)}
-        return replace(tokens, state={**tokens.state, **state})
+        far = torch.minimum(far_ends(geometry.depth, sky), FARTHEST_SKY / scale)
+        return replace(tokens, state={**tokens.state, "scale": scale, "sky": sky >= SKY_THRESHOLD, "far": far})
 
     def decode(self, tokens: Tokens) -> Geometry:
         """See :meth:`Backend.decode`."""
@@ -182,23 +179,14 @@ class DA3NestedBackend(Backend):
         return self.relative.predict_cameras(images, hints)
 
 
-def far_ends(depth: Tensor, sky: Tensor, scale: Tensor) -> Tensor:
-    """Returns the depth of each scene's sky: the 0.99 quantile of its other pixels, at most 200 m.
+def far_ends(depth: Tensor, sky: Tensor) -> Tensor:
+    """Returns the far end of each scene, ``[B]``: the 0.99 quantile of the pixels that are not sky.
 
-    Args:
-        depth: ``[B, V, H, W]``.
-        sky: sky score ``[B, V, H, W]``; sky from 0.3 on.
-        scale: metres per unit of ``depth``, ``[B]``.
-
-    Returns:
-        ``[B]``, in the unit of ``depth``; infinity for a scene with at most ten pixels that are not sky.
+    It is NaN for a scene with at most ten such pixels. Arguments as of :func:`fill_sky`.
     """
-    ends = torch.full_like(scale, torch.inf)
-    for index, (scene, score) in enumerate(zip(depth, sky, strict=True)):
-        ground = scene[score < SKY_THRESHOLD]
-        if ground.numel() > MIN_PIXELS:
-            ends[index] = torch.minimum(quantile(ground, FAR_QUANTILE), FARTHEST_SKY / scale[index])
-    return ends
+    ground = [scene[score < SKY_THRESHOLD] for scene, score in zip(depth, sky, strict=True)]
+    unknown = depth.new_tensor(torch.nan)
+    return torch.stack([quantile(g, FAR_QUANTILE) if len(g) > MIN_PIXELS else unknown for g in ground])
 
 
 def fit_scale(metric_depth: Tensor, sky: Tensor, geometry: Geometry) -> Tensor:

@@ -53,7 +53,7 @@ class SweepBackend(Backend):
     ) -> None:
         if planes < 8 or sources < 1:
             raise ValueError(f"backend.planes must be >= 8 and backend.sources >= 1, got {planes} and {sources}")
-        super().__init__("sweep", PATCH, (DIM,) * TAPS, LICENCE, needs_hints=True, min_views=2, predicts_cameras=False)
+        super().__init__("sweep", PATCH, (DIM,) * TAPS, LICENCE, needs_hints=True, predicts_cameras=False)
         weights = Weights(
             self.name, LICENCE, pretrained, None, None, path or (str(SHIPPED) if pretrained else None), seed
         )
@@ -76,7 +76,7 @@ class SweepBackend(Backend):
         with full_precision(images):
             for scene, pictures in enumerate(images.float()):
                 views = PosedViews(pictures, cameras.world_to_camera[scene], cameras.intrinsics[scene])
-                if len(pictures) < self.min_views or not (camera_distances(views.world_to_camera) > 0).any():
+                if not (camera_distances(views.world_to_camera) > 0).any():
                     why = "got a single view" if len(pictures) == 1 else "all cameras are at the same position"
                     raise ValueError(_NO_PARALLAX.format(why=why))
                 features = self.network.features(pictures)

@@ -91,8 +91,7 @@ def test_inputs_are_not_changed_and_errors_name_the_knob(tmp_path: Path, sphere)
         "max_voxels=1000": {"max_voxels": 1000},
         "take larger voxels": {"voxel_size": 1e-7},
         "voxel_size must be positive": {"voxel_size": 0},
-        r"depth must be \[16, 72, 72\]": {"depth": depth[:, :50]},
-        "colors must be": {"colors": colors[:1]},
+        r"depth and colors must be \[\(16, 72, 72\)": {"depth": depth[:, :50]},
         "depth has values that are not finite": {"depth": depth / 0},
     }.items():
         with pytest.raises(ValueError, match=message):

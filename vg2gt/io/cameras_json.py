@@ -2,15 +2,16 @@
 
 The file is a list of objects ``name``, ``width``, ``height``, ``intrinsics`` (3 rows of 3, integer pixel centres) and
 ``world_to_camera`` (4 rows of 4, OpenCV axes). A reconstruction adds ``photo`` (the whole photograph's camera),
-``similarity`` (4 rows of 4, transform from this file's world to that of the given or estimated cameras) and
-``metres_per_unit`` (null: unknown). Other fields are ignored. The file of the same name from 3D Gaussian Splatting has
-other fields; it is refused, naming the missing one.
+``similarity`` (4 rows of 4, transform from this file's world to that of the given or estimated cameras) and, if known,
+``metres_per_unit``. Other fields are ignored. The file of the same name from 3D Gaussian Splatting has other fields; it
+is refused, naming the missing one.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,6 @@ from vg2gt.io.files import read_json, write_json
 from vg2gt.io.json_checks import Fields, check_rigid
 from vg2gt.types import Cameras
 
-MOST_PIXELS = 1 << 28  # per image to render; the largest photographs have fewer
 _ROTATION_TOLERANCE = 1e-3
 
 
@@ -77,22 +77,8 @@ class NamedCamera:
 
     def fields(self) -> dict[str, Any]:
         """Returns the camera as the plain values of its JSON object."""
-        fields: dict[str, Any] = {
-            "name": self.name,
-            "width": int(self.width),
-            "height": int(self.height),
-            "intrinsics": np.asarray(self.intrinsics, np.float64).tolist(),
-            "world_to_camera": np.asarray(self.world_to_camera, np.float64).tolist(),
-        }
-        if self.photo is not None:
-            photo = self.photo
-            intrinsics = np.asarray(photo.intrinsics, np.float64).tolist()
-            size = {"name": photo.name, "width": int(photo.width), "height": int(photo.height)}
-            fields["photo"] = {**size, "intrinsics": intrinsics, "lens": photo.lens}
-        if self.similarity is not None:
-            fields["similarity"] = np.asarray(self.similarity, np.float64).tolist()
-            fields["metres_per_unit"] = self.metres_per_unit
-        return fields
+        plain = json.loads(json.dumps(asdict(self), default=lambda values: values.tolist()))
+        return {name: value for name, value in plain.items() if value is not None}
 
 
 def invert_pose(pose: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -175,8 +161,6 @@ def _optics(fields: Fields) -> tuple[int, int, NDArray[np.float64]]:
             "positive focal lengths and no skew; undistort the images"
         )
     width, height = (fields.pixels(name, required=True) or 0 for name in ("width", "height"))
-    if width * height > MOST_PIXELS:
-        raise FormatError(f"{fields.place[:-1]} has {width}x{height} pixels, more than {MOST_PIXELS} in all")
     return width, height, intrinsics
 
 

@@ -107,7 +107,6 @@ def write_json(path: str | Path, content: Any) -> Path:
 def whole_folder(target: Path) -> Iterator[Path]:
     """Yields a folder to write into, which replaces ``target`` at the end of the block; on an error it is removed."""
     staged = temporary_name(target)
-    shutil.rmtree(staged, ignore_errors=True)
     staged.mkdir(parents=True)
     try:
         yield staged

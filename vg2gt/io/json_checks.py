@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from vg2gt.io.errors import FormatError
 
-MAX_SIZE = 1 << 20  # pixels along an image's side
+MAX_SIZE = 1 << 16  # pixels along an image's side
 
 
 class Fields:

@@ -114,13 +114,9 @@ def write_mesh(path: str | Path, mesh: Mesh) -> Path:
 
 def _check(depth: Tensor, cameras: Cameras, colors: Tensor, voxel_size: float) -> None:
     views, (height, width) = cameras.world_to_camera.shape[1], cameras.size
-    if len(cameras.world_to_camera) != 1 or depth.shape != (views, height, width) or min(height, width) < 2:
-        raise ValueError(
-            f"depth must be {[views, height, width]}, at least 2x2, with one camera per map of one scene, got depth "
-            f"{list(depth.shape)} and cameras of {len(cameras.world_to_camera)} scenes; use Cameras.scene"
-        )
-    if colors.shape != (views, 3, height, width):
-        raise ValueError(f"colors must be {[views, 3, height, width]} like depth, got {list(colors.shape)}")
+    wanted, found = [(views, height, width), (views, 3, height, width)], [depth.shape, colors.shape]
+    if len(cameras.world_to_camera) != 1 or found != wanted or min(height, width) < 2:
+        raise ValueError(f"depth and colors must be {wanted}, at least 2x2, of one scene, got {list(map(tuple, found))}")
     tensors = {"depth": depth, "world_to_camera": cameras.world_to_camera, "intrinsics": cameras.intrinsics}
     for name, tensor in tensors.items():
         if not torch.isfinite(tensor).all():
