@@ -54,12 +54,10 @@ class OracleBackend(Backend):
         depth_noise: standard deviation of the relative depth error.
         pose_noise: see above; None means ``0.1 * depth_noise``.
         response: change of log-depth per unit change of the tokens.
-        background: depth of pixels without ground truth, such as sky, in multiples of the scene's largest depth; at
-            least 1. They get the lowest confidence. None leaves them without depth.
         seed: seed of the noise and of the frozen weights.
 
     Raises:
-        ValueError: if ``dim`` does not fit, or a noise level or ``background`` is out of range.
+        ValueError: if ``dim`` does not fit, or a noise level is negative.
     """
 
     needs_depth: ClassVar[bool] = True
@@ -72,7 +70,6 @@ class OracleBackend(Backend):
         depth_noise: float = 0.02,
         pose_noise: float | None = None,
         response: float = 0.02,
-        background: float | None = None,
         seed: int = 0,
     ) -> None:
         pose_noise = 0.1 * depth_noise if pose_noise is None else pose_noise
@@ -80,13 +77,10 @@ class OracleBackend(Backend):
             raise ValueError(f"backend.dim must be a multiple of 4 and at least {2 * GEOMETRY_CHANNELS}, got {dim}")
         if depth_noise < 0 or pose_noise < 0:
             raise ValueError(f"noise must not be negative: depth_noise {depth_noise}, pose_noise {pose_noise}")
-        if background is not None and background < 1:
-            raise ValueError(f"backend.background must be at least 1 (deepest depths) or null, got {background}")
         super().__init__("oracle", patch_size, (dim,) * taps, licence="Apache-2.0 (no weights)", needs_hints=True)
         self.depth_noise = depth_noise
         self.pose_noise = pose_noise
         self.response = response
-        self.background = background
         self.seed = seed
         image_dim = dim - GEOMETRY_CHANNELS
         with seeded_initialisation(seed):
@@ -119,9 +113,6 @@ class OracleBackend(Backend):
             error = (predicted / depth.clamp_min(1e-6) - 1).abs()
             confidence = 1 + 4 * torch.exp(-error / max(self.depth_noise, 0.01)) * torch.exp(0.3 * doubt)
             confidence = torch.where(depth > 0, confidence, INVALID_CONFIDENCE)
-            if self.background is not None:
-                far = self.background * depth.amax((1, 2, 3), keepdim=True)
-                predicted = torch.where(depth > 0, predicted, far)
             geometry = _describe_patches(predicted, confidence, cameras, grid)
             patch = self._tokens(images, geometry)
             camera = self.camera_projection(_describe_cameras(cameras, _median_depth(predicted)))

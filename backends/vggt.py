@@ -188,7 +188,6 @@ class VGGTBackend(NetworkBackend):
         camera_heads: attention heads of the camera head.
     """
 
-    backbone_name = "aggregator"
     camera_name = "camera_head"
     network: VGGTNetwork
 
@@ -213,7 +212,6 @@ class VGGTBackend(NetworkBackend):
         path: str | None = None,
         seed: int = 0,
         head_chunk: int | None = 8,
-        compile: bool = False,
         freeze: bool = True,
     ) -> None:
         def make() -> VGGTNetwork:
@@ -224,7 +222,7 @@ class VGGTBackend(NetworkBackend):
             return network
 
         weights = Weights(name, licence, pretrained, repo, revision, path, seed, ignorable=IGNORABLE)
-        super().__init__(make, weights, patch_size, 2 * dim, taps, head_chunk, compile, freeze)
+        super().__init__(make, weights, patch_size, 2 * dim, taps, head_chunk, freeze)
 
     def encode_checked(self, images: Tensor, hints: Hints | None) -> Tokens:
         """See :meth:`NetworkBackend.encode_checked`."""

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from backends.base import seeded_initialisation
 from vg2gt.io.tensors import read_tensors
 
-WEIGHT_FILES = ("model.safetensors", "model.pt")
+WEIGHT_FILE = "model.safetensors"
 SHOWN = 500  # characters of torch's message, which lists every tensor
 
 Network = TypeVar("Network", bound=nn.Module)
@@ -31,7 +31,7 @@ class Weights:
         pretrained: whether to load published weights, otherwise seeded random ones.
         repo: Hugging Face repository.
         revision: branch, tag or commit of the repository; None for the newest.
-        path: local file, or folder with ``model.safetensors`` or ``model.pt``, instead of the repository.
+        path: local file, or folder with ``model.safetensors``, instead of the repository.
         seed: seed of random weights.
         prefix: prefix of the keys in the file, before the network's own names.
         ignorable: prefixes of keys that may be in the file but not in the network.
@@ -81,27 +81,26 @@ class Weights:
         remedy = f"give backend.path=FILE_OR_FOLDER, or backend.pretrained=false for random ones (repository: {repo})"
         if self.path is not None:
             given = Path(self.path).expanduser()
-            candidates = [given / file for file in WEIGHT_FILES] if given.is_dir() else [given]
-            for candidate in candidates:
-                if candidate.is_file():
-                    return candidate
-            raise FileNotFoundError(f"no weights for backend {name} at {', '.join(map(str, candidates))}: {remedy}")
+            file = given / WEIGHT_FILE if given.is_dir() else given
+            if not file.is_file():
+                raise FileNotFoundError(f"no weights for backend {name} at {file}: {remedy}")
+            return file
         if repo is None:
             raise FileNotFoundError(f"backend {name} has no published weights: {remedy}")
         try:
             from huggingface_hub import hf_hub_download  # pyright: ignore[reportMissingImports]
         except ImportError as error:
             raise ImportError(
-                f"backend {name} loads {WEIGHT_FILES[0]} from {repo} with huggingface_hub, which is not installed: "
+                f"backend {name} loads {WEIGHT_FILE} from {repo} with huggingface_hub, which is not installed: "
                 f"pip install 'vg2gt[hub]', or {remedy}"
             ) from error
         print(f"{name}: looking for {repo} on the hub or in its cache", file=sys.stderr)
         logging.getLogger("huggingface_hub").setLevel(logging.ERROR)  # logs several lines per attempt
         try:
-            return Path(hf_hub_download(repo, WEIGHT_FILES[0], revision=self.revision))
+            return Path(hf_hub_download(repo, WEIGHT_FILE, revision=self.revision))
         except Exception as error:  # raises its own errors and those of requests and httpx
             raise FileNotFoundError(
-                f"cannot get {WEIGHT_FILES[0]} of {repo} (revision {self.revision or 'newest'}) for backend {name}: "
+                f"cannot get {WEIGHT_FILE} of {repo} (revision {self.revision or 'newest'}) for backend {name}: "
                 f"{' '.join(str(error).split()).rstrip('.')}. Check the network and the revision, or {remedy}"
             ) from error
 

@@ -121,7 +121,6 @@ class DA3Backend(NetworkBackend):
         ValueError: if the reference-view strategy is unknown.
     """
 
-    backbone_name = "backbone.pretrained"
     camera_name = "cam_dec"
     network: DA3Network
 
@@ -150,7 +149,6 @@ class DA3Backend(NetworkBackend):
         prefix: str = "model.",
         seed: int = 0,
         head_chunk: int | None = 8,
-        compile: bool = False,
         freeze: bool = True,
     ) -> None:
         if reference_view not in get_args(ReferenceView):
@@ -174,7 +172,7 @@ class DA3Backend(NetworkBackend):
         ignorable = (*(prefix + part for part in unused), *(part for part in NESTED_PARTS if part != prefix))
         weights = Weights(name, licence, pretrained, repo, revision, path, seed, prefix, ignorable)
         given = {"needs_hints": given_poses}
-        super().__init__(make, weights, patch_size, 2 * dim, taps, head_chunk, compile, freeze, **given)
+        super().__init__(make, weights, patch_size, 2 * dim, taps, head_chunk, freeze, **given)
         self.reference_view: ReferenceView = reference_view
 
     def encode_checked(self, images: Tensor, hints: Hints | None) -> Tokens:

@@ -28,15 +28,6 @@ FARTHEST_SKY = 200.0  # metres
 SKY_CONFIDENCE = 1.0  # lower bound of DA3's confidence, 1 + exp
 
 
-class DA3MetricNetwork(nn.Module):
-    """Single-view backbone and head for depth and sky; names and shapes as published."""
-
-    def __init__(self, backbone: Backbone, head: DPT) -> None:
-        super().__init__()
-        self.backbone = nn.ModuleDict({"pretrained": backbone})
-        self.head = head
-
-
 class DA3MetricBackend(NetworkBackend):
     """DA3's metric network: predicts metric depth of single views; cameras are those of the data, confidence is 1.
 
@@ -45,7 +36,7 @@ class DA3MetricBackend(NetworkBackend):
     the arguments see :class:`NetworkBackend`; ``depth`` is the number of blocks.
     """
 
-    network: DA3MetricNetwork
+    network: nn.ModuleDict
 
     def __init__(
         self,
@@ -67,10 +58,10 @@ class DA3MetricBackend(NetworkBackend):
         seed: int = 0,
         head_chunk: int | None = 8,
     ) -> None:
-        def make() -> DA3MetricNetwork:
+        def make() -> nn.ModuleDict:
             backbone = Backbone(dim, depth, num_heads, "mlp", None, image_size, patch_size)
             head = DPT(dim, features, out_channels, 1, patch_size, normalize=False, position_weight=0, sky=True)
-            return DA3MetricNetwork(backbone, head)
+            return nn.ModuleDict({"backbone": nn.ModuleDict({"pretrained": backbone}), "head": head})
 
         ignorable = tuple(part for part in NESTED_PARTS if part != prefix)
         weights = Weights(name, licence, pretrained, repo, revision, path, seed, prefix, ignorable)
@@ -81,14 +72,14 @@ class DA3MetricBackend(NetworkBackend):
         assert hints is not None
         assert hints.cameras is not None
         with half_precision_on_gpu(images):
-            patch, camera = self.network.backbone["pretrained"](normalize_images(images), self.taps)
+            patch, camera = self.network.get_submodule("backbone.pretrained")(normalize_images(images), self.taps)
         tokens = self.as_tokens(images, patch, camera)
         return replace(tokens, state={"cameras": hints.cameras, "factor": metres(hints.cameras)})
 
     def decode_raw(self, tokens: Tokens) -> tuple[Tensor, Tensor]:
         """Returns the network's depth, before filling the sky, and its sky score, both ``[B, V, H, W]``."""
         with full_precision(tokens.camera):
-            out = in_chunks(self.network.head, tokens.patch, tokens.grid, self.head_chunk)
+            out = in_chunks(self.network["head"], tokens.patch, tokens.grid, self.head_chunk)
         return out[:, :, 0].exp(), F.relu(out[:, :, 1])
 
     def decode(self, tokens: Tokens) -> Geometry:

@@ -116,7 +116,9 @@ def _check(depth: Tensor, cameras: Cameras, colors: Tensor, voxel_size: float) -
     views, (height, width) = cameras.world_to_camera.shape[1], cameras.size
     wanted, found = [(views, height, width), (views, 3, height, width)], [depth.shape, colors.shape]
     if len(cameras.world_to_camera) != 1 or found != wanted or min(height, width) < 2:
-        raise ValueError(f"depth and colors must be {wanted}, at least 2x2, of one scene, got {list(map(tuple, found))}")
+        raise ValueError(
+            f"depth and colors must be {wanted}, at least 2x2, of one scene, got {list(map(tuple, found))}"
+        )
     tensors = {"depth": depth, "world_to_camera": cameras.world_to_camera, "intrinsics": cameras.intrinsics}
     for name, tensor in tensors.items():
         if not torch.isfinite(tensor).all():

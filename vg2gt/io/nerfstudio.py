@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vg2gt.io.cameras_json import Fields, check_rigid
 from vg2gt.io.files import read_json, write_json
-from vg2gt.io.json_checks import Fields, check_rigid
 
 PIXEL_CENTER = 0.5  # centre of the first pixel in the file; ours is at 0
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
@@ -144,9 +144,7 @@ def read_transforms(path: str | Path) -> Transforms:
     path = Path(path)
     top = Fields(f"{path}: ", read_json(path))
     shared = _read_lens(top, Lens())
-    frames = top.get("frames", list, "a list of frames")
-    if frames is None:
-        raise top.wrong("frames", "a list of frames")
+    frames = top.get("frames", list, "a list of frames", required=True)
     read = [_read_frame(Fields(f"{path}: frames[{i}].", frame), shared) for i, frame in enumerate(frames)]
     return Transforms(tuple(read), top.get("ply_file_path", str, "a file name"))
 

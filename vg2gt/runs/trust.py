@@ -29,7 +29,7 @@ OWN = ("vg2gt", "backends")
 KINDS = (nn.Module, SceneSource, SceneScale, ViewCheck, Renderer)
 """Classes of this project that a run's file may name, besides data modules; their constructors at most read files."""
 
-GONE = ("drift", "provider")
+GONE = ("background", "compile", "drift", "provider")
 """Options of backends in runs of former versions, which no network depends on."""
 
 
@@ -61,9 +61,15 @@ def parse_run_config(text: str, source: str | Path) -> DictConfig:
         raise ValueError(f"{source} is not a run's configuration: {' '.join(str(error).split())}") from error
     if not isinstance(content, dict):
         raise ValueError(f"{source} is not a run's configuration: expected a mapping")
-    if isinstance(backend := content.get("backend"), dict):
-        content["backend"] = {key: value for key, value in backend.items() if key not in GONE}
+    if "backend" in content:
+        content["backend"] = _without_gone(content["backend"])
     return OmegaConf.create(content)
+
+
+def _without_gone(part: Any) -> Any:
+    if not isinstance(part, dict):
+        return part
+    return {key: _without_gone(value) for key, value in part.items() if key not in GONE}
 
 
 def check_targets(config: Any, source: str | Path) -> None:
