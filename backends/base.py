@@ -123,17 +123,11 @@ class Backend(nn.Module, ABC):
             raise ValueError(f"images must be [B, V, 3, H, W] with no empty dimension, got {list(images.shape)}")
         height, width = images.shape[-2:]
         if height % self.patch_size or width % self.patch_size:
-            nearest = [max(round(size / self.patch_size), 1) * self.patch_size for size in (height, width)]
-            raise ValueError(
-                f"image size {height}x{width} is not a multiple of the patch size {self.patch_size} of backend "
-                f"{self.name}: resize or crop, for example to {nearest[0]}x{nearest[1]}"
-            )
+            size = f"image size {height}x{width} is not a multiple of the patch size {self.patch_size}"
+            raise ValueError(f"{size} of backend {self.name}: resize or crop the images")
         low, high = torch.aminmax(images)
         if not (low >= 0 and high <= 1):  # also catches NaN
-            raise ValueError(
-                f"images must be finite and in [0, 1], got values from {float(low):.4g} to {float(high):.4g}: "
-                "divide 8-bit images by 255 and clamp after resizing"
-            )
+            raise ValueError(f"images must be finite and in [0, 1], got {float(low):.4g} to {float(high):.4g}")
 
     def as_tokens(self, images: Tensor, patch: Sequence[Tensor], camera: Tensor) -> Tokens:
         """Packs the outputs of a backbone as float32 tokens.
@@ -173,10 +167,8 @@ class Backend(nn.Module, ABC):
             bad = ~finite | (intrinsics[..., [0, 1], [0, 1]] <= 0).any(-1)  # [B, V]
             if bad.any():
                 scene, view = bad.nonzero()[0].tolist()
-                raise ValueError(
-                    f"hints.cameras of scene {scene}, view {view} are not finite or have no positive focal length: "
-                    "leave the view out, or correct its pose and intrinsics"
-                )
+                place = f"hints.cameras of scene {scene}, view {view}"
+                raise ValueError(f"{place} are not finite or have no positive focal length: leave the view out")
         return hints
 
 

@@ -171,8 +171,7 @@ class DA3Backend(NetworkBackend):
         unused = (*RAY_BRANCH, "gs_head.", *(() if given_poses else ("cam_enc.",)))
         ignorable = (*(prefix + part for part in unused), *(part for part in NESTED_PARTS if part != prefix))
         weights = Weights(name, licence, pretrained, repo, revision, path, seed, prefix, ignorable)
-        given = {"needs_hints": given_poses}
-        super().__init__(make, weights, patch_size, 2 * dim, taps, head_chunk, freeze, **given)
+        super().__init__(make, weights, patch_size, 2 * dim, taps, head_chunk, freeze, needs_hints=given_poses)
         self.reference_view: ReferenceView = reference_view
 
     def encode_checked(self, images: Tensor, hints: Hints | None) -> Tokens:

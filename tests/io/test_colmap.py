@@ -83,6 +83,7 @@ def test_images_are_ordered_as_people_count_and_points_may_be_missing(tmp_path: 
         ("images", ("0 0 0 0 1 a", "0 inf 0 0 1 a")),
         ("images", ("1 0 0 0 0", "0 0 0 0 0")),
         ("points3D", ("0 0 4", "0 nan 4")),
+        ("points3D", ("0 0 4", "0 1e300 4")),
     ],
 )
 def test_values_that_are_not_finite_are_refused(tmp_path: Path, name: str, change: tuple[str, str]) -> None:
@@ -90,7 +91,7 @@ def test_values_that_are_not_finite_are_refused(tmp_path: Path, name: str, chang
     assert len(io.read_colmap(tmp_path).points3D) == 1
     path = tmp_path / f"{name}.txt"
     path.write_text(path.read_text().replace(*change))
-    with pytest.raises(io.FormatError, match=rf"{name}\.txt: number [17] has values that are not finite"):
+    with pytest.raises(io.FormatError, match=rf"{name}\.txt: .*values that are not finite"):
         io.read_colmap(tmp_path)
 
 

@@ -100,9 +100,7 @@ def named_cameras(cameras: Cameras, names: Sequence[str]) -> list[NamedCamera]:
     """
     scenes, views = cameras.world_to_camera.shape[:2]
     if scenes != 1 or views != len(names):
-        raise ValueError(
-            f"expected one scene and one name per view, got {scenes} scenes, {views} views, {len(names)} names"
-        )
+        raise ValueError(f"expected 1 scene and a name per view, got {scenes}, {views} views, {len(names)} names")
     poses, intrinsics = (t[0].detach().cpu().double().numpy() for t in (cameras.world_to_camera, cameras.intrinsics))
     height, width = cameras.size
     return [NamedCamera(name, width, height, k, pose) for name, k, pose in zip(names, intrinsics, poses, strict=True)]

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import re
 import struct
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -33,6 +34,7 @@ Camera: TypeAlias = Any
 
 PIXEL_CENTER = 0.5  # centre of the first pixel in COLMAP; ours is at 0
 FILES = ("cameras", "images", "points3D")
+_NOT_FINITE = re.compile(r"[\s-](nan|inf)\b", re.IGNORECASE)
 _FAR = 1e30  # larger values are as senseless as those that are not finite
 EXTRA = "pip install 'vg2gt[colmap]'"
 
@@ -79,10 +81,8 @@ def read_colmap(folder: str | Path) -> Reconstruction:
     folder = Path(folder)
     files = colmap_files(folder)
     if not files:
-        raise FormatError(
-            f"{folder}: no COLMAP model here, expected {', '.join(FILES)} all as .bin or all as .txt; give the model's "
-            "own folder, usually sparse/0"
-        )
+        kinds = f"{', '.join(FILES)} all as .bin or all as .txt"
+        raise FormatError(f"{folder}: no COLMAP model here, expected {kinds}; its folder is usually sparse/0")
     require_pycolmap(f"reading the COLMAP model {folder}")
     import pycolmap  # pyright: ignore[reportMissingImports]
 
@@ -100,13 +100,14 @@ def read_colmap(folder: str | Path) -> Reconstruction:
             model = pycolmap.Reconstruction(temporary)
             senseless = _senseless(model)
         except (ValueError, IndexError, KeyError, RuntimeError, MemoryError) as error:
-            raise FormatError(f"{folder}: damaged COLMAP model ({' '.join(str(error).split())[:200]})") from error
+            texts = {path: path.read_text(errors="replace") for path in files.values() if path.suffix == ".txt"}
+            not_finite = [path for path, text in texts.items() if _NOT_FINITE.search(text)]
+            where = f"{not_finite[0]}: values that are not finite" if not_finite else f"{folder}: damaged COLMAP model"
+            raise FormatError(f"{where} ({' '.join(str(error).split())[:200]})") from error
     for name, numbers in senseless.items():
         if numbers:
-            raise FormatError(
-                f"{files[name]}: number {numbers[0]} has values that are not finite or make no sense; correct or "
-                "remove it, or export the model again"
-            )
+            what = f"number {numbers[0]} has values that are not finite or make no sense"
+            raise FormatError(f"{files[name]}: {what}; correct or remove it, or export the model again")
     return model
 
 
@@ -138,9 +139,7 @@ def colmap_intrinsics(camera: Camera) -> NDArray[np.float64]:
         ValueError: if the camera model has no focal length (EQUIRECTANGULAR).
     """
     if not len(camera.focal_length_idxs()):
-        raise ValueError(
-            f"camera {camera.camera_id}: {camera.model_name} has no pinhole equivalent; convert images to cube faces"
-        )
+        raise ValueError(f"{camera.model_name} has no pinhole equivalent; convert images to cube faces")
     matrix = np.array(camera.calibration_matrix(), np.float64)
     matrix[:2, 2] -= PIXEL_CENTER
     return matrix

@@ -19,7 +19,7 @@ from vg2gt.geometry.normals import normals_from_depth
 from vg2gt.io.files import write_bytes
 from vg2gt.types import Cameras
 
-SUFFIXES = (".ply", ".glb", ".obj")
+SUFFIXES = (".ply", ".glb")
 _TRUNCATION = 4  # distance from a surface at which free space begins, in voxels
 _BLOCK = 8  # voxels along a block's edge
 _KEY_BITS = 20  # voxel indices lie in [-2^20, 2^20)
@@ -91,7 +91,7 @@ def write_mesh(path: str | Path, mesh: Mesh) -> Path:
     """Writes a mesh with trimesh, atomically, in our world frame, ``.glb`` with y up; the suffix selects the format.
 
     Args:
-        path: a file ending in ``.ply``, ``.glb`` or ``.obj``.
+        path: a file ending in ``.ply`` or ``.glb``.
         mesh: mesh to write; not changed.
 
     Raises:
@@ -108,8 +108,8 @@ def write_mesh(path: str | Path, mesh: Mesh) -> Path:
     if path.suffix.lower() == ".glb":
         body.apply_transform(np.diag([1.0, -1.0, -1.0, 1.0]))  # glTF has y up, our world has y down
     content = body.export(file_type=path.suffix[1:].lower())
-    assert not isinstance(content, dict)  # only formats with several files give a dict
-    return write_bytes(path, content.encode() if isinstance(content, str) else content)
+    assert isinstance(content, bytes)
+    return write_bytes(path, content)
 
 
 def _check(depth: Tensor, cameras: Cameras, colors: Tensor, voxel_size: float) -> None:
@@ -146,18 +146,14 @@ def _surface_blocks(depth: Tensor, cameras: Cameras, voxel_size: float, max_voxe
             points = unproject(shifted[None, None], cameras.select(slice(view, view + 1)))[0, 0][shifted > 0]
             index = torch.floor(points / voxel_size)
             if len(index) and index.abs().max() >= limit:
-                raise ValueError(
-                    f"the scene reaches {points.abs().max():.4g} units from the origin, more than {limit} voxels of "
-                    f"{voxel_size:g}; set far depth to 0 or take larger voxels"
-                )
+                reach = f"the scene reaches more than {limit} voxels of {voxel_size:g} from the origin"
+                raise ValueError(f"{reach}; set far depth to 0 or take larger voxels")
             voxels = _unpack(torch.unique(_pack(index.long())))
             touched = torch.div(voxels[:, None] + around, _BLOCK, rounding_mode="floor")
             blocks = torch.unique(torch.cat((blocks, _pack(touched.reshape(-1, 3)))))
         if len(blocks) * _BLOCK**3 > max_voxels:
-            raise ValueError(
-                f"the surfaces need more than max_voxels={max_voxels} voxels of {voxel_size:g}; take larger voxels, "
-                "set far depth to 0, or raise max_voxels"
-            )
+            need = f"the surfaces need more than max_voxels={max_voxels} voxels of {voxel_size:g}"
+            raise ValueError(f"{need}; take larger voxels, or set far depth to 0")
     return _unpack(blocks)
 
 

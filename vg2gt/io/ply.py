@@ -100,9 +100,7 @@ def read_gaussian_ply(path: str | Path) -> Gaussians:
     found = table.dtype.names or ()
     rest = tuple(f"f_rest_{i}" for i in range(sum(name.startswith("f_rest_") for name in found)))
     if len(rest) not in (0, 9, 24, 45):
-        raise FormatError(
-            f"{path}: {len(rest)} f_rest properties, expected 0, 9, 24 or 45 (degree 0 to 3); write the file again"
-        )
+        raise FormatError(f"{path}: {len(rest)} f_rest properties, expected 0, 9, 24 or 45 (degree 0 to 3)")
     higher = _columns(path, table, rest).reshape(len(table), 3, len(rest) // 3).transpose(0, 2, 1)
     sh = np.concatenate((_columns(path, table, _DC)[:, None], higher), 1)
     with np.errstate(over="ignore"):  # infinite results are counted and dropped later
@@ -166,10 +164,7 @@ def _read_vertices(path: Path) -> tuple[NDArray, list[str]]:
     dtype, count = _layout(path, [line.split() for line in lines])
     needed, left = count * dtype.itemsize, len(data) - offset
     if needed > left:
-        raise FormatError(
-            f"{path}, byte {offset}: {count} vertices of {dtype.itemsize} bytes need {needed} bytes, {left} are left; "
-            "the file is truncated or damaged"
-        )
+        raise FormatError(f"{path}: {count} vertices need {needed} bytes, {left} are left; it is truncated or damaged")
     return np.frombuffer(data, dtype, count, offset), comments
 
 
