@@ -57,10 +57,8 @@ class Weights:
         """
         if not self.pretrained:
             if self.path is not None:
-                raise ValueError(
-                    f"backend {self.name}: pretrained=false requests random weights, but path={self.path} is set; "
-                    "remove one of them"
-                )
+                conflict = f"pretrained=false requests random weights, but path={self.path} is set"
+                raise ValueError(f"backend {self.name}: {conflict}; remove one of them")
             with seeded_initialisation(self.seed):
                 return make()
         file = self.find()
@@ -90,19 +88,17 @@ class Weights:
         try:
             from huggingface_hub import hf_hub_download  # pyright: ignore[reportMissingImports]
         except ImportError as error:
-            raise ImportError(
-                f"backend {name} loads {WEIGHT_FILE} from {repo} with huggingface_hub, which is not installed: "
-                f"pip install 'vg2gt[hub]', or {remedy}"
-            ) from error
+            needed = f"backend {name} loads {WEIGHT_FILE} from {repo} with huggingface_hub"
+            raise ImportError(f"{needed}: pip install 'vg2gt[hub]', or {remedy}") from error
         print(f"{name}: looking for {repo} on the hub or in its cache", file=sys.stderr)
         logging.getLogger("huggingface_hub").setLevel(logging.ERROR)  # logs several lines per attempt
         try:
             return Path(hf_hub_download(repo, WEIGHT_FILE, revision=self.revision))
         except Exception as error:  # raises its own errors and those of requests and httpx
-            raise FileNotFoundError(
-                f"cannot get {WEIGHT_FILE} of {repo} (revision {self.revision or 'newest'}) for backend {name}: "
-                f"{' '.join(str(error).split()).rstrip('.')}. Check the network and the revision, or {remedy}"
-            ) from error
+            wanted = f"{WEIGHT_FILE} of {repo} (revision {self.revision or 'newest'}) for backend {name}"
+            reason = " ".join(str(error).split()).rstrip(".")
+            check = f"Check the network and the revision, or {remedy}"
+            raise FileNotFoundError(f"cannot get {wanted}: {reason}. {check}") from error
 
 
 def load_strictly(

@@ -72,10 +72,8 @@ def load_matrices(
         )
         if not fits or array.dtype.kind not in "fiu":
             expected = "x".join("N" if size is None else str(size) for size in shape)
-            raise DataError(
-                f"{name} in {path} of scene {scene} must hold {expected} numbers, not {array.dtype} of shape "
-                f"{array.shape}"
-            )
+            found = f"{array.dtype} of shape {array.shape}"
+            raise DataError(f"{name} in {path} of scene {scene} must hold {expected} numbers, not {found}")
     return {name: arrays[name].astype(np.float64) for name in shapes}
 
 

@@ -155,10 +155,7 @@ def _optics(fields: Fields) -> tuple[int, int, NDArray[np.float64]]:
     intrinsics = _matrix(fields, "intrinsics", 3)
     focal = intrinsics[[0, 1], [0, 1]]
     if (focal <= 0).any() or np.abs(intrinsics[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]] - [0, 0, 0, 0, 1]).max() > 1e-9:
-        raise FormatError(
-            f"{fields.place}intrinsics is {intrinsics.tolist()}, expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with "
-            "positive focal lengths and no skew; undistort the images"
-        )
+        raise fields.wrong("intrinsics", "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive focal lengths, no skew")
     width, height = (fields.pixels(name, required=True) or 0 for name in ("width", "height"))
     return width, height, intrinsics
 
@@ -230,10 +227,8 @@ def check_rigid(place: str, matrix: NDArray[np.float64], tolerance: float) -> No
     rotation = matrix[:3, :3]
     error = np.abs(rotation.T @ rotation - np.eye(3)).max() if np.abs(rotation).max() < 2 else math.inf
     if error > tolerance or np.linalg.det(rotation) < 0 or np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
-        raise FormatError(
-            f"{place} is not a rotation and a translation (R'R differs from the identity by {error:.2g}); remove "
-            "scale, shear and mirroring"
-        )
+        what = f"is not a rotation and a translation (R'R differs from the identity by {error:.2g})"
+        raise FormatError(f"{place} {what}; remove scale, shear and mirroring")
 
 
 def short(value: Any) -> str:

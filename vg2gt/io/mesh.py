@@ -20,6 +20,7 @@ from vg2gt.io.files import write_bytes
 from vg2gt.types import Cameras
 
 SUFFIXES = (".ply", ".glb")
+MAX_VOXELS = 64_000_000  # bounds the memory at about 3 GB
 _TRUNCATION = 4  # distance from a surface at which free space begins, in voxels
 _BLOCK = 8  # voxels along a block's edge
 _KEY_BITS = 20  # voxel indices lie in [-2^20, 2^20)
@@ -43,9 +44,7 @@ class Mesh:
     colors: NDArray[np.uint8]
 
 
-def fuse_depth(
-    depth: Tensor, cameras: Cameras, colors: Tensor, *, voxel_size: float, max_voxels: int = 64_000_000
-) -> Mesh:
+def fuse_depth(depth: Tensor, cameras: Cameras, colors: Tensor, *, voxel_size: float) -> Mesh:
     """Fuses depth maps of one scene into a mesh.
 
     Averages a truncated signed distance along the optical axis over the views, at voxels near surfaces. The mesh is its
@@ -57,18 +56,17 @@ def fuse_depth(
         cameras: cameras of the V views of one scene (B = 1), of the depth maps' size.
         colors: ``[V, 3, H, W]`` in [0, 1].
         voxel_size: edge length of a voxel in scene units; smaller details are lost.
-        max_voxels: maximum number of voxels, which bounds the memory at about 50 bytes each (3 GB).
 
     Returns:
         The mesh; empty if there is no valid depth.
 
     Raises:
-        ValueError: if shapes disagree, a value is not finite, or ``max_voxels`` is exceeded.
+        ValueError: if shapes disagree, a value is not finite, or :data:`MAX_VOXELS` is exceeded.
     """
     _check(depth, cameras, colors, voxel_size)
     cameras = cameras.map(lambda tensor: tensor.detach().cpu().float())
     depth, colors = depth.detach().cpu().float(), colors.detach().cpu().float()
-    blocks = _surface_blocks(depth, cameras, voxel_size, max_voxels)
+    blocks = _surface_blocks(depth, cameras, voxel_size)
     inside = torch.stack(torch.meshgrid(*3 * [torch.arange(_BLOCK)], indexing="ij"), -1).reshape(-1, 3)
     # weighted sums at the voxels of each block: signed distance over the truncation, colour; and the weights
     sums, weight = torch.zeros(len(blocks), _BLOCK**3, 4), torch.zeros(len(blocks), _BLOCK**3)
@@ -127,7 +125,7 @@ def _check(depth: Tensor, cameras: Cameras, colors: Tensor, voxel_size: float) -
         raise ValueError(f"voxel_size must be positive, got {voxel_size}")
 
 
-def _surface_blocks(depth: Tensor, cameras: Cameras, voxel_size: float, max_voxels: int) -> Tensor:
+def _surface_blocks(depth: Tensor, cameras: Cameras, voxel_size: float) -> Tensor:
     """Blocks ``[N, 3]`` with a point within the truncation before or behind a depth sample, sorted, unique.
 
     A block starts at voxel ``_BLOCK * index``; the centre of voxel i is at ``(i + 1/2) * voxel_size``.
@@ -151,8 +149,8 @@ def _surface_blocks(depth: Tensor, cameras: Cameras, voxel_size: float, max_voxe
             voxels = _unpack(torch.unique(_pack(index.long())))
             touched = torch.div(voxels[:, None] + around, _BLOCK, rounding_mode="floor")
             blocks = torch.unique(torch.cat((blocks, _pack(touched.reshape(-1, 3)))))
-        if len(blocks) * _BLOCK**3 > max_voxels:
-            need = f"the surfaces need more than max_voxels={max_voxels} voxels of {voxel_size:g}"
+        if len(blocks) * _BLOCK**3 > MAX_VOXELS:
+            need = f"the surfaces need more than {MAX_VOXELS} voxels of {voxel_size:g}"
             raise ValueError(f"{need}; take larger voxels, or set far depth to 0")
     return _unpack(blocks)
 

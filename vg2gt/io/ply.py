@@ -141,10 +141,8 @@ def _columns(path: Path, table: NDArray, names: tuple[str, ...]) -> NDArray[np.f
     """Stacks properties to ``[N, len(names)]``, float64."""
     missing = [name for name in names if name not in (table.dtype.names or ())]
     if missing:
-        raise FormatError(
-            f"{path}: vertices have no {', '.join(missing)}, only {', '.join(table.dtype.names or ())}; expected "
-            "x y z f_dc_* opacity scale_* rot_* (a compressed PLY is converted by PlayCanvas's splat-transform)"
-        )
+        what = f"vertices have no {', '.join(missing)}, only {', '.join(table.dtype.names or ())}"
+        raise FormatError(f"{path}: {what} (a compressed PLY is converted by PlayCanvas's splat-transform)")
     values = np.empty((len(table), len(names)))
     with np.errstate(invalid="ignore"):  # signalling NaNs of damaged files become quiet NaNs
         for i, name in enumerate(names):
@@ -185,10 +183,8 @@ def _layout(path: Path, lines: list[list[str]]) -> tuple[np.dtype, int]:
             case ["property", kind, name] if count >= 0 and kind in _TYPES and name not in types:
                 types[name] = order + _TYPES[kind]
             case _:
-                raise FormatError(
-                    f"{path}, line {number} of the header: unexpected {' '.join(words)[:60]!r}; the file is damaged or "
-                    f"does not begin with binary vertices (expected the format {' or '.join(_ENCODINGS)})"
-                )
+                what = f"line {number} of the header: unexpected {' '.join(words)[:60]!r}"
+                raise FormatError(f"{path}, {what}; it is damaged, or does not begin with binary vertices")
     if not types:
         raise FormatError(f"{path}: no vertices in the header; this is not a file of points")
     return np.dtype(list(types.items())), count
