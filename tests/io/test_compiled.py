@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from numba.core.dispatcher import Dispatcher
 
 from tests.commands import ROOT
 from vg2gt.kernels import compiled
@@ -145,17 +144,3 @@ def test_kernels_take_what_they_need_from_their_own_room() -> None:
         ]
     assert kernels >= 9
     assert not wrong
-
-
-def test_kernels_made_in_functions_are_found_again_by_other_processes() -> None:
-    """A kernel in a closure has another key in every process, which would compile it again and leave one more file."""
-    made = [
-        kernel
-        for path in sorted((*ROOT.glob("vg2gt/**/*.py"), *ROOT.glob("backends/**/*.py")))
-        if "import kernel" in path.read_text()
-        for kernel in vars(importlib.import_module(".".join(path.relative_to(ROOT).with_suffix("").parts))).values()
-        if isinstance(kernel, Dispatcher) and kernel.py_func.__closure__
-    ]
-    assert len(made) >= 6
-    for kernel in made:
-        assert all(isinstance(cell.cell_contents, bool) for cell in kernel.py_func.__closure__), kernel

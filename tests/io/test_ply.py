@@ -37,10 +37,8 @@ def assert_same(read: Gaussians, written: Gaussians) -> None:
     ("comment", "background"),
     [
         ("background 0.25 0.5 1", [[0.25, 0.5, 1.0]]),
-        ("background 0.25 0.5", None),
         ("background 0.25 0.5 1.5", None),
         ("background grey", None),
-        ("made by somebody 0.25 0.5 1", None),
     ],
 )
 def test_the_colour_behind_a_scene(tmp_path: Path, comment: str, background: list[list[float]] | None) -> None:
@@ -55,7 +53,7 @@ def test_the_colour_behind_a_scene(tmp_path: Path, comment: str, background: lis
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-@pytest.mark.parametrize("count", [0, 1, 300])
+@pytest.mark.parametrize("count", [0, 30])
 def test_header_byte_for_byte_and_round_trip(tmp_path: Path, degree: int, count: int) -> None:
     before = scene(count, degree)
     path = write_gaussian_ply(tmp_path / "scene.ply", before)
