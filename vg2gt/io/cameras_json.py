@@ -185,7 +185,7 @@ class Fields:
         return FormatError(f"{self.place}{name} is {short(self.content.get(name))}, expected {expected}")
 
     def get(self, name: str, kind: type, expected: str, required: bool = False) -> Any:
-        """Returns a field of type ``kind``; None if it is missing and not ``required``."""
+        """Returns a field of type ``kind``; None if it is missing, unless ``required``."""
         value = self.content.get(name)
         if not isinstance(value, kind) and (required or value is not None):
             raise self.wrong(name, expected)
@@ -204,11 +204,9 @@ class Fields:
     def pixels(self, name: str, required: bool = False) -> int | None:
         """Returns a whole number of pixels; None if it is missing and not ``required``."""
         value = self.number(name, 0, MAX_SIZE)
-        if value is None and not required:
-            return None
-        if value is None or value != round(value):
+        if (required and value is None) or (value is not None and value != round(value)):
             raise self.wrong(name, "a whole number of pixels")
-        return round(value)
+        return None if value is None else round(value)
 
     def matrix(self, name: str, rows: Sequence[int], columns: int) -> NDArray[np.float64]:
         """Returns a matrix whose number of rows is one of ``rows``; its values may be NaN or infinite."""
