@@ -30,7 +30,7 @@ KINDS = (nn.Module, SceneSource, SceneScale, ViewCheck, Renderer)
 """Classes of this project that a run's file may name, besides data modules; their constructors at most read files."""
 
 GONE = ("background", "compile", "drift", "provider")
-"""Options of backends in runs of former versions, which no network depends on."""
+"""Options that our backends had in former versions; no network depends on them."""
 
 
 class UntrustedError(ValueError):
@@ -69,7 +69,8 @@ def parse_run_config(text: str, source: str | Path) -> DictConfig:
 def _without_gone(part: Any) -> Any:
     if not isinstance(part, dict):
         return part
-    return {key: _without_gone(value) for key, value in part.items() if key not in GONE}
+    gone = GONE if str(part.get("_target_")).startswith("backends.") else ()
+    return {key: _without_gone(value) for key, value in part.items() if key not in gone}
 
 
 def check_targets(config: Any, source: str | Path) -> None:
