@@ -27,9 +27,7 @@ class Backend(nn.Module, ABC):
         token_dims: channels of the patch tokens, one entry per tapped layer, in tap order.
         licence: licence of the weights, printed when they are loaded.
         is_metric: True if ``Geometry.scale`` turns the decoded depth into metres.
-        supports_gradient: True if ``decode`` is differentiable with respect to ``tokens.patch``.
         needs_hints: True if ``encode`` requires hints, at least cameras.
-        min_views: minimum number of views; ``encode`` raises ValueError for fewer.
         predicts_cameras: False if its cameras are those of the hints.
 
     Attributes:
@@ -50,9 +48,7 @@ class Backend(nn.Module, ABC):
         token_dims: tuple[int, ...],
         licence: str,
         is_metric: bool = False,
-        supports_gradient: bool = True,
         needs_hints: bool = False,
-        min_views: int = 1,
         predicts_cameras: bool = True,
     ) -> None:
         super().__init__()
@@ -61,9 +57,7 @@ class Backend(nn.Module, ABC):
         self.token_dims = tuple(token_dims)
         self.licence = licence
         self.is_metric = is_metric
-        self.supports_gradient = supports_gradient
         self.needs_hints = needs_hints
-        self.min_views = min_views
         self.predicts_cameras = predicts_cameras
         self._identity: dict[str, str] | None = None
 
@@ -90,8 +84,7 @@ class Backend(nn.Module, ABC):
             tokens: output of ``encode``, whose patch tokens may be modified.
 
         Returns:
-            Depth, confidence and raw cameras. With ``supports_gradient``, depth and confidence are differentiable with
-            respect to ``tokens.patch``.
+            Depth, confidence and raw cameras; depth and confidence are differentiable with respect to ``tokens.patch``.
         """
 
     def decode_cameras(self, tokens: Tokens) -> Cameras:
@@ -130,17 +123,11 @@ class Backend(nn.Module, ABC):
             raise ValueError(f"images must be [B, V, 3, H, W] with no empty dimension, got {list(images.shape)}")
         height, width = images.shape[-2:]
         if height % self.patch_size or width % self.patch_size:
-            nearest = [max(round(size / self.patch_size), 1) * self.patch_size for size in (height, width)]
-            raise ValueError(
-                f"image size {height}x{width} is not a multiple of the patch size {self.patch_size} of backend "
-                f"{self.name}: resize or crop, for example to {nearest[0]}x{nearest[1]}"
-            )
+            size = f"image size {height}x{width} is not a multiple of the patch size {self.patch_size}"
+            raise ValueError(f"{size} of backend {self.name}: resize or crop the images")
         low, high = torch.aminmax(images)
         if not (low >= 0 and high <= 1):  # also catches NaN
-            raise ValueError(
-                f"images must be finite and in [0, 1], got values from {float(low):.4g} to {float(high):.4g}: "
-                "divide 8-bit images by 255 and clamp after resizing"
-            )
+            raise ValueError(f"images must be finite and in [0, 1], got {float(low):.4g} to {float(high):.4g}")
 
     def as_tokens(self, images: Tensor, patch: Sequence[Tensor], camera: Tensor) -> Tokens:
         """Packs the outputs of a backbone as float32 tokens.
@@ -180,10 +167,8 @@ class Backend(nn.Module, ABC):
             bad = ~finite | (intrinsics[..., [0, 1], [0, 1]] <= 0).any(-1)  # [B, V]
             if bad.any():
                 scene, view = bad.nonzero()[0].tolist()
-                raise ValueError(
-                    f"hints.cameras of scene {scene}, view {view} are not finite or have no positive focal length: "
-                    "leave the view out, or correct its pose and intrinsics"
-                )
+                place = f"hints.cameras of scene {scene}, view {view}"
+                raise ValueError(f"{place} are not finite or have no positive focal length: leave the view out")
         return hints
 
 

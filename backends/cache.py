@@ -82,19 +82,13 @@ class TokenCache:
         return found
 
     def _remove_oldest(self) -> None:
-        kept = []
-        for file in self.folder.glob("*.pt"):
-            with suppress(OSError):  # removed by another process
-                found = file.stat()
-                kept.append((found.st_mtime, found.st_size, file))
-        kept.sort()
-        excess = sum(size for _, size, _ in kept) - self.max_bytes
-        for _, size, file in kept[:-1]:
-            if excess <= 0:
-                break
-            with suppress(OSError):
-                file.unlink(missing_ok=True)
-            excess -= size
+        with suppress(OSError):  # another process removes files as well, and does so after its next one
+            kept = sorted((file.stat().st_mtime, file.stat().st_size, file) for file in self.folder.glob("*.pt"))
+            excess = sum(size for _, size, _ in kept) - self.max_bytes
+            for _, size, file in kept[:-1]:
+                if excess > 0:
+                    file.unlink(missing_ok=True)
+                excess -= size
 
 
 def cache_key(backend: Backend, images: Tensor, hints: Hints | None) -> str:

@@ -11,7 +11,7 @@ from torch.utils.checkpoint import checkpoint
 
 from backends.positions import uv_embedding
 from vg2gt.geometry.precision import full_precision
-from vg2gt.types import Tokens
+from vg2gt.types import Cameras, Geometry, Tokens
 
 POSITION_WEIGHT = 0.1
 HIDDEN = 32
@@ -158,14 +158,15 @@ def in_chunks(head: nn.Module, tokens: Sequence[Tensor], grid: tuple[int, int], 
     return out.unflatten(0, tokens[0].shape[:2])
 
 
-def decode_depth(head: nn.Module, tokens: Tokens, chunk: int | None) -> tuple[Tensor, Tensor]:
-    """Decodes z-depth (> 0) and confidence (> 1), each ``[B, V, H, W]``, with a head of two channels, in float32.
+def decode_geometry(head: nn.Module, tokens: Tokens, cameras: Cameras, chunk: int | None) -> Geometry:
+    """Decodes z-depth (> 0) and confidence (> 1) with a head of two channels, in float32.
 
     Args:
         head: the DPT.
         tokens: tokens of all views.
+        cameras: their decoded cameras.
         chunk: see :func:`in_chunks`.
     """
     with full_precision(tokens.camera):
         out = in_chunks(head, tokens.patch, tokens.grid, chunk)  # [B, V, 2, H, W]
-    return out[:, :, 0].exp(), 1 + out[:, :, 1].exp()
+    return Geometry(out[:, :, 0].exp(), 1 + out[:, :, 1].exp(), cameras, torch.ones_like(out[:, 0, 0, 0, 0]))

@@ -77,13 +77,11 @@ class NetworkBackend(Backend):
         prefix: prefix of the names in the file.
         seed: seed of random weights.
         head_chunk: maximum number of views to decode at a time; None decodes all at once.
-        compile: whether to ``torch.compile`` the backbone.
         freeze: whether to freeze the network. Otherwise all of it except the camera head is trained, and checkpoints
             include it. Cameras and initial geometry are treated as constants.
     """
 
     network: Any
-    backbone_name: str  # name of the submodule that computes tokens
     camera_name = ""  # name of the submodule that decodes cameras
 
     def __init__(
@@ -94,7 +92,6 @@ class NetworkBackend(Backend):
         token_dim: int,
         taps: Sequence[int],
         head_chunk: int | None,
-        compile: bool = False,
         freeze: bool = True,
         **properties: bool,
     ) -> None:
@@ -105,8 +102,6 @@ class NetworkBackend(Backend):
         self.head_chunk = head_chunk
         self.weights = weights
         self.network = weights.build(make)
-        if compile:
-            self.network.get_submodule(self.backbone_name).compile()
         self.frozen = freeze
         self.freeze()
 

@@ -1,18 +1,21 @@
 """ONNX bundles: folders with a frozen network split into encoder and decoder; written by ``vg2gt export``.
 
 The encoder runs in onnxruntime, the decoder is rebuilt as a torch module from its class and arguments.
+
+``backend.json`` holds ``name``, ``licence``, ``patch_size`` and ``token_dims`` of the exported backend, sha256 of its
+``weights`` (checkpoints are matched with it), ``needs_hints`` (whether the encoder also takes ``world_to_camera`` and
+``intrinsics``), ``class`` and ``arguments`` of the ``decoder``, and ``max_difference`` (largest relative difference of
+``encoder`` and ``decoder`` to torch at export).
 """
 
 from __future__ import annotations
 
 import importlib.util
 import os
-import tempfile
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 import onnxruntime
 import torch
@@ -24,14 +27,14 @@ from backends.base import Backend
 from backends.da3.backend import DA3Backend, DA3Decoder
 from backends.vggt import VGGTBackend, VGGTDecoder
 from backends.weights import load_strictly
-from vg2gt.io.files import read_json, write_json
+from vg2gt.io.files import read_json, whole_folder, write_json
 from vg2gt.io.tensors import read_tensors
 from vg2gt.types import Cameras, Geometry, Hints, Tokens
 
 Exportable = VGGTBackend | DA3Backend
-Provider = Literal["auto", "cpu", "cuda"]
 
 DESCRIPTION = "backend.json"
+FIELDS = ("name", "licence", "weights", "patch_size", "token_dims", "needs_hints", "decoder")
 ENCODER, DECODER, DECODER_WEIGHTS = "encoder.onnx", "decoder.onnx", "decoder.safetensors"
 REMEDY = "write it with vg2gt export backend=NAME --out FOLDER"
 DECODERS = {kind.__name__: kind for kind in (VGGTDecoder, DA3Decoder)}  # the only classes that are built from a file
@@ -42,65 +45,40 @@ CHECKED = ((1, 1, 3, 2), (1, 2, 2, 5), (2, 4, 3, 3))
 TOLERANCE = 1e-3  # relative error; a correct graph differs by about 1e-6, a wrong one by far more than 1e-3
 
 
-@dataclass(frozen=True)
-class Description:
-    """Content of ``backend.json``.
-
-    Attributes:
-        name: name of the exported backend.
-        licence: licence of its weights.
-        weights: sha256 of its weights (``Backend.identity``), which checkpoints are matched with.
-        patch_size: edge of a patch in pixels.
-        token_dims: channels of the patch tokens, in tap order.
-        needs_hints: whether the encoder also takes ``world_to_camera`` and ``intrinsics``.
-        decoder: ``class`` and ``arguments`` to rebuild the decoder.
-        max_difference: largest relative difference to torch at export, of ``encoder`` and ``decoder``.
-    """
-
-    name: str
-    licence: str
-    weights: str
-    patch_size: int
-    token_dims: list[int]
-    needs_hints: bool
-    decoder: dict[str, Any]
-    max_difference: dict[str, float]
-
-
 class Graph(nn.Module):
-    """Part of a backend as a function of tensors, for export."""
+    """Part of a backend as a function of tensors, for export: :func:`encode_tensors` or :func:`decode_tensors`."""
 
-    def __init__(self, backend: Exportable) -> None:
+    def __init__(self, backend: Exportable, function: Callable[..., tuple[Tensor, ...]]) -> None:
         super().__init__()
-        self.backend = backend
-
-
-class EncoderGraph(Graph):
-    """Images, and cameras if used, to patch tokens ``[B, V, h, w, D]`` and a camera token."""
+        self.backend, self.function = backend, function
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
-        """Encodes ``[B, V, 3, H, W]`` images; world-to-camera matrices and intrinsics follow if they are used."""
-        images, *cameras = inputs
-        size = (images.shape[-2], images.shape[-1])
-        hints = Hints(cameras=Cameras(cameras[0], cameras[1], size)) if cameras else None
-        tokens = self.backend.encode_checked(images, hints)
-        return (*(tap.unflatten(2, tokens.grid) for tap in tokens.patch), tokens.camera)
+        """Applies the function."""
+        return self.function(self.backend, *inputs)
 
 
-class DecoderGraph(Graph):
-    """Patch tokens ``[B, V, h, w, D]`` and a camera token to depth, confidence and cameras."""
+def encode_tensors(backend: Exportable, images: Tensor, *cameras: Tensor) -> tuple[Tensor, ...]:
+    """Encodes ``[B, V, 3, H, W]`` images; world-to-camera matrices and intrinsics follow if they are used.
 
-    def forward(self, *tokens: Tensor) -> tuple[Tensor, ...]:
-        """Decodes all views at once; the camera token is the last argument."""
-        *patch, camera = tokens
-        grid = (patch[0].shape[2], patch[0].shape[3])
-        size = (grid[0] * self.backend.patch_size, grid[1] * self.backend.patch_size)
-        flat = tuple(tap.flatten(2, 3) for tap in patch)
-        geometry = self.backend.network.decode(Tokens(flat, camera, grid, size), None)
-        return geometry.depth, geometry.depth_conf, geometry.cameras.world_to_camera, geometry.cameras.intrinsics
+    Returns:
+        Patch tokens ``[B, V, h, w, D]`` of every tap, and the camera token.
+    """
+    hints = Hints(cameras=Cameras(cameras[0], cameras[1], (images.shape[-2], images.shape[-1]))) if cameras else None
+    tokens = backend.encode_checked(images, hints)
+    return (*(tap.unflatten(2, tokens.grid) for tap in tokens.patch), tokens.camera)
 
 
-def export(backend: Backend, out: Path) -> Description:
+def decode_tensors(backend: Exportable, *tokens: Tensor) -> tuple[Tensor, ...]:
+    """Decodes the results of :func:`encode_tensors`, all views at once, to depth, confidence, poses and intrinsics."""
+    *patch, camera = tokens
+    grid = (patch[0].shape[2], patch[0].shape[3])
+    size = (grid[0] * backend.patch_size, grid[1] * backend.patch_size)
+    flat = tuple(tap.flatten(2, 3) for tap in patch)
+    geometry = backend.network.decode(Tokens(flat, camera, grid, size), None)
+    return geometry.depth, geometry.depth_conf, geometry.cameras.world_to_camera, geometry.cameras.intrinsics
+
+
+def export(backend: Backend, out: Path) -> dict[str, Any]:
     """Exports a bundle, and verifies it against torch at sizes other than the traced one.
 
     Args:
@@ -122,38 +100,28 @@ def export(backend: Backend, out: Path) -> Description:
         raise FileExistsError(f"{out} exists already: remove it or choose another out=FOLDER")
     if not all(importlib.util.find_spec(package) for package in ("onnx", "onnxscript")):
         raise ImportError("export needs onnx and onnxscript: pip install 'vg2gt[export]'")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as temporary:
-        folder = Path(temporary, "bundle")
-        folder.mkdir()
-        description = _write(backend, folder)
-        os.replace(folder, out)
-    return description
-
-
-def _write(backend: Exportable, folder: Path) -> Description:
     kind = "VGGTDecoder" if isinstance(backend, VGGTBackend) else "DA3Decoder"
     with torch.device("meta"):
         names = DECODERS[kind](**backend.network.arguments).state_dict()
     state = backend.network.state_dict()
-    save_file({name: state[name].contiguous() for name in names}, folder / DECODER_WEIGHTS)
-    description = Description(
-        name=backend.name,
-        licence=backend.licence,
-        weights=backend.identity()["weights"],
-        patch_size=backend.patch_size,
-        token_dims=list(backend.token_dims),
-        needs_hints=backend.needs_hints,
-        decoder={"class": kind, "arguments": backend.network.arguments},
-        max_difference=_export_graphs(backend, folder),
-    )
-    write_json(folder / DESCRIPTION, asdict(description))
+    description = {
+        **backend.identity(),
+        "licence": backend.licence,
+        "patch_size": backend.patch_size,
+        "token_dims": list(backend.token_dims),
+        "needs_hints": backend.needs_hints,
+        "decoder": {"class": kind, "arguments": backend.network.arguments},
+    }
+    with whole_folder(out) as folder:
+        save_file({name: state[name].contiguous() for name in names}, folder / DECODER_WEIGHTS)
+        description["max_difference"] = _export_graphs(backend, folder)
+        write_json(folder / DESCRIPTION, description)
     return description
 
 
 def _export_graphs(backend: Exportable, folder: Path) -> dict[str, float]:
     """Writes both graphs; returns their largest :func:`relative_difference` to torch, at sizes not traced."""
-    encoder, decoder = EncoderGraph(backend).eval(), DecoderGraph(backend).eval()
+    encoder, decoder = (Graph(backend, function).eval() for function in (encode_tensors, decode_tensors))
     tokens = token_names(len(backend.token_dims))
     names = ["images", "world_to_camera", "intrinsics"][: 3 if backend.needs_hints else 1]
     worst = {"encoder": 0.0, "decoder": 0.0}
@@ -161,7 +129,7 @@ def _export_graphs(backend: Exportable, folder: Path) -> dict[str, float]:
         inputs = example_inputs(backend, *TRACED)
         export_graph(encoder, inputs, names, tokens, folder / ENCODER)
         export_graph(decoder, encoder(*inputs), tokens, DECODED, folder / DECODER)
-        sessions = [open_session(folder / file, "cpu") for file in (ENCODER, DECODER)]
+        sessions = [open_session(folder / file) for file in (ENCODER, DECODER)]
         for shape in CHECKED:
             inputs = example_inputs(backend, *shape)
             encoded = encoder(*inputs)
@@ -240,43 +208,29 @@ def relative_difference(found: Tensor, expected: Tensor) -> float:
 class OnnxBackend(Backend):
     """Network exported by ``vg2gt export``.
 
-    Name, licence and identity are those of the exported network, so both accept the same checkpoints. If the folder has
-    no ``decoder.safetensors``, ``decode`` runs ``decoder.onnx`` and is not differentiable.
+    Name, licence and identity are those of the exported network, so both accept the same checkpoints. The encoder runs
+    on the GPU if onnxruntime has the CUDA provider.
 
     Args:
         path: folder of the bundle.
-        provider: where to run the encoder; ``auto`` uses the GPU if onnxruntime has the CUDA provider.
-        head_chunk: maximum number of views that the torch decoder decodes at a time; None decodes all at once.
+        head_chunk: maximum number of views that the decoder decodes at a time; None decodes all at once.
 
     Raises:
         FileNotFoundError: if ``path`` is not a bundle or lacks a file.
-        ValueError: if a file is damaged or does not fit, or the provider is unknown.
-        RuntimeError: if the provider is not available.
+        ValueError: if a file is damaged or does not fit.
     """
 
-    def __init__(self, path: str | None = None, provider: Provider = "auto", head_chunk: int | None = 8) -> None:
+    def __init__(self, path: str | None = None, head_chunk: int | None = 8) -> None:
         if path is None:
             raise ValueError(f"backend=onnx needs backend.path=FOLDER: {REMEDY}")
-        if provider not in get_args(Provider):
-            raise ValueError(f"backend.provider is {provider!r}; choose one of {', '.join(get_args(Provider))}")
         folder = Path(path).expanduser()
-        description = read_description(folder)
-        decoder = load_decoder(folder, description.decoder)
-        super().__init__(
-            description.name,
-            description.patch_size,
-            tuple(description.token_dims),
-            description.licence,
-            supports_gradient=decoder is not None,
-            needs_hints=description.needs_hints,
-        )
-        self._identity = {"name": description.name, "weights": description.weights}
+        found = read_description(folder)
+        dims = tuple(found["token_dims"])
+        super().__init__(found["name"], found["patch_size"], dims, found["licence"], needs_hints=found["needs_hints"])
+        self._identity = {"name": found["name"], "weights": found["weights"]}
         self.head_chunk = head_chunk
-        self.decoder = decoder
-        self.encoder_session = open_session(folder / ENCODER, provider)
-        self.decoder_session = open_session(folder / DECODER, provider) if decoder is None else None
-        if decoder is None:
-            warnings.warn(f"{folder} has no {DECODER_WEIGHTS}: {self.name} decodes without gradient", stacklevel=2)
+        self.encoder_session = open_session(folder / ENCODER)
+        self.decoder = load_decoder(folder, found["decoder"])
         print(f"{self.name}: ONNX bundle {folder}, licence: {self.licence}")
         self.freeze()
 
@@ -294,18 +248,11 @@ class OnnxBackend(Backend):
 
     def decode(self, tokens: Tokens) -> Geometry:
         """See :meth:`Backend.decode`."""
-        if self.decoder is not None:
-            return self.decoder.decode(tokens, self.head_chunk)
-        assert self.decoder_session is not None
-        values = (*(tap.unflatten(2, tokens.grid) for tap in tokens.patch), tokens.camera)
-        inputs = dict(zip(token_names(len(tokens.patch)), values, strict=True))
-        depth, confidence, world_to_camera, intrinsics = run_session(self.decoder_session, inputs, DECODED)
-        cameras = Cameras(world_to_camera, intrinsics, tokens.size)
-        return Geometry(depth, confidence, cameras, torch.ones_like(depth[:, 0, 0, 0]))
+        return self.decoder.decode(tokens, self.head_chunk)
 
     def decode_cameras(self, tokens: Tokens) -> Cameras:
         """See :meth:`Backend.decode_cameras`."""
-        return super().decode_cameras(tokens) if self.decoder is None else self.decoder.decode_cameras(tokens)
+        return self.decoder.decode_cameras(tokens)
 
 
 def token_names(taps: int) -> list[str]:
@@ -313,62 +260,55 @@ def token_names(taps: int) -> list[str]:
     return [*(f"patch_{index}" for index in range(taps)), "camera"]
 
 
-def read_description(folder: Path) -> Description:
-    """Reads the description of a bundle; only the decoder's weights may be missing from the folder.
+def read_description(folder: Path) -> dict[str, Any]:
+    """Reads ``backend.json`` of a bundle.
 
     Raises:
-        FileNotFoundError: if another file is missing.
+        FileNotFoundError: if one of the files that :class:`OnnxBackend` reads is missing.
         ValueError: if the description is not valid.
     """
-    for name in (DESCRIPTION, ENCODER, DECODER):
+    for name in (DESCRIPTION, ENCODER, DECODER_WEIGHTS):
         if not (folder / name).is_file():
             raise FileNotFoundError(f"{folder} is not an ONNX bundle, {name} is missing: copy all of it, or {REMEDY}")
-    try:
-        content = read_json(folder / DESCRIPTION)
-        return Description(**{field.name: content[field.name] for field in fields(Description)})
-    except (ValueError, RecursionError, KeyError, TypeError) as error:
-        raise ValueError(f"{folder / DESCRIPTION} does not describe a bundle ({error!r}): {REMEDY}") from error
+    content = read_json(folder / DESCRIPTION)
+    missing = [name for name in FIELDS if not isinstance(content, dict) or name not in content]
+    if missing:
+        raise ValueError(f"{folder / DESCRIPTION} does not describe a bundle, {missing[0]} is missing: {REMEDY}")
+    return content
 
 
-def load_decoder(folder: Path, decoder: Mapping[str, Any]) -> VGGTDecoder | DA3Decoder | None:
-    """Rebuilds the decoder of a bundle from its ``class`` and ``arguments``; returns None if there are no weights.
+def load_decoder(folder: Path, decoder: Mapping[str, Any]) -> VGGTDecoder | DA3Decoder:
+    """Rebuilds the decoder of a bundle from its ``class`` and ``arguments``.
 
     Raises:
         ValueError: if the class is not one of :data:`DECODERS`, or the arguments or weights do not fit.
     """
-    file = folder / DECODER_WEIGHTS
-    if not file.is_file():
-        return None
     try:
         with torch.device("meta"):
             module = DECODERS[decoder["class"]](**decoder["arguments"])
     except (KeyError, RuntimeError, TypeError, ValueError) as error:
-        raise ValueError(
-            f"{folder / DESCRIPTION} does not describe a {' or '.join(DECODERS)} ({error!r}): {REMEDY}, or remove "
-            f"{DECODER_WEIGHTS} to decode without gradient"
-        ) from error
-    load_strictly(module, read_tensors(file), "", (), str(file))
+        known = " or ".join(DECODERS)
+        raise ValueError(f"{folder / DESCRIPTION} does not describe a {known} ({error!r}): {REMEDY}") from error
+    load_strictly(module, read_tensors(folder / DECODER_WEIGHTS), "", (), str(folder / DECODER_WEIGHTS))
     return module
 
 
-def open_session(file: Path, provider: Provider) -> onnxruntime.InferenceSession:
-    """Opens an ONNX file on this process's GPU or the CPU, with torch's number of threads; errors as OnnxBackend's."""
+def open_session(file: Path) -> onnxruntime.InferenceSession:
+    """Opens an ONNX file on this process's GPU if onnxruntime can use it, else on the CPU with torch's threads.
+
+    Raises:
+        ValueError: if onnxruntime cannot open the file.
+    """
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = torch.get_num_threads()
     providers: list[str | tuple[str, dict[str, str]]] = ["CPUExecutionProvider"]
-    if provider != "cpu" and CUDA in onnxruntime.get_available_providers():
+    if CUDA in onnxruntime.get_available_providers():
         # Plain float32 as in torch, not TF32. In distributed training, every process has its own GPU.
         providers.insert(0, (CUDA, {"device_id": os.environ.get("LOCAL_RANK", "0"), "use_tf32": "0"}))
     try:
-        session = onnxruntime.InferenceSession(str(file), options, providers=providers)
+        return onnxruntime.InferenceSession(str(file), options, providers=providers)
     except Exception as error:  # onnxruntime's own classes have no common base
         raise ValueError(f"onnxruntime {onnxruntime.__version__} cannot open {file} ({error}): {REMEDY}") from error
-    if provider == "cuda" and CUDA not in session.get_providers():
-        raise RuntimeError(
-            f"backend.provider=cuda, but onnxruntime only has {', '.join(session.get_providers())}: install "
-            "onnxruntime-gpu in place of onnxruntime, or use backend.provider=cpu"
-        )
-    return session
 
 
 def run_session(

@@ -18,7 +18,7 @@ from torch.nn import functional as F
 
 from backends.base import Backend, seeded_initialisation
 from backends.vit import PatchEmbed, ViTBlock
-from vg2gt.geometry.cameras import invert_rigid, relative_to_first, scale_translations, unproject
+from vg2gt.geometry.cameras import invert_rigid, relative_to_first, unproject
 from vg2gt.geometry.precision import full_precision
 from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.types import Cameras, Geometry, Hints, Tokens
@@ -40,8 +40,7 @@ class OracleBackend(Backend):
     Confidence is 1 plus ``4 exp(-|relative error| / max(depth_noise, 0.01))`` times log-normal noise. Standard
     deviations of the camera errors, per axis, are ``0.5 * pose_noise`` rad for rotations and ``pose_noise`` median
     depths of the view for positions; view 0 is exact. The noise of a view is seeded by (seed, scene, frame) and does
-    not depend on the order and number of views. ``drift`` scales depth and positions of all views given together by one
-    random factor in ``1 +- drift``, seeded by their frames.
+    not depend on the order and number of views.
 
     Tokens concatenate the image features of a small frozen random ViT with the predicted geometry of the patch, and mix
     the channels by a fixed rotation. ``decode`` multiplies depth by ``exp(response * u)``, where u is a fixed random
@@ -55,13 +54,10 @@ class OracleBackend(Backend):
         depth_noise: standard deviation of the relative depth error.
         pose_noise: see above; None means ``0.1 * depth_noise``.
         response: change of log-depth per unit change of the tokens.
-        drift: see above; in [0, 1).
-        background: depth of pixels without ground truth, such as sky, in multiples of the scene's largest depth; at
-            least 1. They get the lowest confidence. None leaves them without depth.
         seed: seed of the noise and of the frozen weights.
 
     Raises:
-        ValueError: if ``dim`` does not fit, or a noise level, ``drift`` or ``background`` is out of range.
+        ValueError: if ``dim`` does not fit, or a noise level is negative.
     """
 
     needs_depth: ClassVar[bool] = True
@@ -74,8 +70,6 @@ class OracleBackend(Backend):
         depth_noise: float = 0.02,
         pose_noise: float | None = None,
         response: float = 0.02,
-        drift: float = 0.0,
-        background: float | None = None,
         seed: int = 0,
     ) -> None:
         pose_noise = 0.1 * depth_noise if pose_noise is None else pose_noise
@@ -83,16 +77,10 @@ class OracleBackend(Backend):
             raise ValueError(f"backend.dim must be a multiple of 4 and at least {2 * GEOMETRY_CHANNELS}, got {dim}")
         if depth_noise < 0 or pose_noise < 0:
             raise ValueError(f"noise must not be negative: depth_noise {depth_noise}, pose_noise {pose_noise}")
-        if not 0 <= drift < 1:
-            raise ValueError(f"backend.drift must be at least 0 and below 1, got {drift}")
-        if background is not None and background < 1:
-            raise ValueError(f"backend.background must be at least 1 (deepest depths) or null, got {background}")
         super().__init__("oracle", patch_size, (dim,) * taps, licence="Apache-2.0 (no weights)", needs_hints=True)
         self.depth_noise = depth_noise
         self.pose_noise = pose_noise
-        self.drift = drift
         self.response = response
-        self.background = background
         self.seed = seed
         image_dim = dim - GEOMETRY_CHANNELS
         with seeded_initialisation(seed):
@@ -119,17 +107,12 @@ class OracleBackend(Backend):
         grid = (height // self.patch_size, width // self.patch_size)
         with full_precision(images):
             images, depth = images.float(), hints.depth.float()
-            unit = self._unit(hints, depth)
-            depth = depth * unit[:, None, None, None]
             relative, poses, doubt = self._draw(hints, (height, width), depth)
-            cameras = self._predict_cameras(scale_translations(hints.cameras, unit), depth, poses)
+            cameras = self._predict_cameras(hints.cameras, depth, poses)
             predicted = _bleed(depth * (1 + self.depth_noise * relative))
             error = (predicted / depth.clamp_min(1e-6) - 1).abs()
             confidence = 1 + 4 * torch.exp(-error / max(self.depth_noise, 0.01)) * torch.exp(0.3 * doubt)
             confidence = torch.where(depth > 0, confidence, INVALID_CONFIDENCE)
-            if self.background is not None:
-                far = self.background * depth.amax((1, 2, 3), keepdim=True)
-                predicted = torch.where(depth > 0, predicted, far)
             geometry = _describe_patches(predicted, confidence, cameras, grid)
             patch = self._tokens(images, geometry)
             camera = self.camera_projection(_describe_cameras(cameras, _median_depth(predicted)))
@@ -150,18 +133,13 @@ class OracleBackend(Backend):
             depth = depth * torch.exp(self.response * residual.reshape(depth.shape))
         return Geometry(depth, tokens.state["confidence"], cameras, torch.ones_like(depth[:, 0, 0, 0]))
 
-    def _unit(self, hints: Hints, like: Tensor) -> Tensor:
-        """Scale factor ``[B]`` from ``drift``; exactly 1 if it is 0."""
-        assert hints.frame_ids is not None
-        named = zip(hints.scene_key, hints.frame_ids.tolist(), strict=True)
-        rngs = [_generator(f"drift {self.seed}/{scene}/{frames}") for scene, frames in named]
-        return like.new_tensor([1 + self.drift * rng.uniform(-1, 1) for rng in rngs])
-
     def _draw(self, hints: Hints, size: tuple[int, int], like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Unit noise of depth ``[B, V, H, W]``, cameras ``[B, V, 6]`` and confidence, from one generator per view."""
         assert hints.frame_ids is not None
         named = zip(hints.scene_key, hints.frame_ids.tolist(), strict=True)
-        rngs = [_generator(f"{self.seed}/{scene}/{frame}") for scene, frames in named for frame in frames]
+        names = [f"{self.seed}/{scene}/{frame}" for scene, frames in named for frame in frames]
+        digests = [hashlib.sha256(name.encode()).digest() for name in names]
+        rngs = [np.random.default_rng(int.from_bytes(digest, "big")) for digest in digests]
         shapes = (NOISE_GRID, (1, 1), (6,), size)
         views = [[rng.standard_normal(shape, dtype=np.float32) for shape in shapes] for rng in rngs]
         fields, constants, poses, doubt = (
@@ -192,10 +170,6 @@ class OracleBackend(Backend):
             content = F.layer_norm(features, features.shape[-1:]).unflatten(0, images.shape[:2])
             tokens.append(torch.cat((content, geometry), -1) @ mixing)
         return tuple(tokens)
-
-
-def _generator(name: str) -> np.random.Generator:
-    return np.random.default_rng(int.from_bytes(hashlib.sha256(name.encode()).digest(), "big"))
 
 
 def _median_depth(depth: Tensor, per_view: bool = False) -> Tensor:

@@ -6,12 +6,13 @@ Module names follow the published weight file (``facebook/VGGT-1B``).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from backends.dpt import DPT, decode_depth
+from backends.dpt import DPT, decode_geometry
 from backends.network import NetworkBackend, decode_pose, normalize_images, predict
 from backends.positions import grid_positions, resize_position_embedding, rotary_2d
 from backends.vit import PatchEmbed, ViTBlock, ViTMLP, first_and_others
@@ -149,21 +150,15 @@ class VGGTDecoder(nn.Module):
         camera_heads: int,
     ) -> None:
         super().__init__()
-        self.arguments = {
-            "token_dim": token_dim,
-            "features": features,
-            "out_channels": list(out_channels),
-            "patch_size": patch_size,
-            "camera_depth": camera_depth,
-            "camera_heads": camera_heads,
-        }
+        sizes = {"token_dim": token_dim, "features": features, "patch_size": patch_size}
+        sizes |= {"camera_depth": camera_depth, "camera_heads": camera_heads}
+        self.arguments: dict[str, Any] = {**sizes, "out_channels": list(out_channels)}
         self.camera_head = CameraHead(token_dim, camera_depth, camera_heads)
         self.depth_head = DPT(token_dim, features, out_channels, 2, patch_size, rectified_skip=True)
 
     def decode(self, tokens: Tokens, chunk: int | None) -> Geometry:
         """See :meth:`Backend.decode`; the depth head runs on at most ``chunk`` views at a time."""
-        depth, confidence = decode_depth(self.depth_head, tokens, chunk)
-        return Geometry(depth, confidence, self.decode_cameras(tokens), torch.ones_like(depth[:, 0, 0, 0]))
+        return decode_geometry(self.depth_head, tokens, self.decode_cameras(tokens), chunk)
 
     def decode_cameras(self, tokens: Tokens) -> Cameras:
         """See :meth:`Backend.decode_cameras`."""
@@ -193,7 +188,6 @@ class VGGTBackend(NetworkBackend):
         camera_heads: attention heads of the camera head.
     """
 
-    backbone_name = "aggregator"
     camera_name = "camera_head"
     network: VGGTNetwork
 
@@ -218,7 +212,6 @@ class VGGTBackend(NetworkBackend):
         path: str | None = None,
         seed: int = 0,
         head_chunk: int | None = 8,
-        compile: bool = False,
         freeze: bool = True,
     ) -> None:
         def make() -> VGGTNetwork:
@@ -229,7 +222,7 @@ class VGGTBackend(NetworkBackend):
             return network
 
         weights = Weights(name, licence, pretrained, repo, revision, path, seed, ignorable=IGNORABLE)
-        super().__init__(make, weights, patch_size, 2 * dim, taps, head_chunk, compile, freeze)
+        super().__init__(make, weights, patch_size, 2 * dim, taps, head_chunk, freeze)
 
     def encode_checked(self, images: Tensor, hints: Hints | None) -> Tokens:
         """See :meth:`NetworkBackend.encode_checked`."""

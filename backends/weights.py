@@ -15,8 +15,8 @@ from torch import Tensor, nn
 from backends.base import seeded_initialisation
 from vg2gt.io.tensors import read_tensors
 
-WEIGHT_FILES = ("model.safetensors", "model.pt")
-SHOWN = 5
+WEIGHT_FILE = "model.safetensors"
+SHOWN = 500  # characters of torch's message, which lists every tensor
 
 Network = TypeVar("Network", bound=nn.Module)
 
@@ -31,7 +31,7 @@ class Weights:
         pretrained: whether to load published weights, otherwise seeded random ones.
         repo: Hugging Face repository.
         revision: branch, tag or commit of the repository; None for the newest.
-        path: local file, or folder with ``model.safetensors`` or ``model.pt``, instead of the repository.
+        path: local file, or folder with ``model.safetensors``, instead of the repository.
         seed: seed of random weights.
         prefix: prefix of the keys in the file, before the network's own names.
         ignorable: prefixes of keys that may be in the file but not in the network.
@@ -57,10 +57,8 @@ class Weights:
         """
         if not self.pretrained:
             if self.path is not None:
-                raise ValueError(
-                    f"backend {self.name}: pretrained=false requests random weights, but path={self.path} is set; "
-                    "remove one of them"
-                )
+                conflict = f"pretrained=false requests random weights, but path={self.path} is set"
+                raise ValueError(f"backend {self.name}: {conflict}; remove one of them")
             with seeded_initialisation(self.seed):
                 return make()
         file = self.find()
@@ -81,29 +79,26 @@ class Weights:
         remedy = f"give backend.path=FILE_OR_FOLDER, or backend.pretrained=false for random ones (repository: {repo})"
         if self.path is not None:
             given = Path(self.path).expanduser()
-            candidates = [given / file for file in WEIGHT_FILES] if given.is_dir() else [given]
-            for candidate in candidates:
-                if candidate.is_file():
-                    return candidate
-            raise FileNotFoundError(f"no weights for backend {name} at {', '.join(map(str, candidates))}: {remedy}")
+            file = given / WEIGHT_FILE if given.is_dir() else given
+            if not file.is_file():
+                raise FileNotFoundError(f"no weights for backend {name} at {file}: {remedy}")
+            return file
         if repo is None:
             raise FileNotFoundError(f"backend {name} has no published weights: {remedy}")
         try:
             from huggingface_hub import hf_hub_download  # pyright: ignore[reportMissingImports]
         except ImportError as error:
-            raise ImportError(
-                f"backend {name} loads {WEIGHT_FILES[0]} from {repo} with huggingface_hub, which is not installed: "
-                f"pip install 'vg2gt[hub]', or {remedy}"
-            ) from error
+            needed = f"backend {name} loads {WEIGHT_FILE} from {repo} with huggingface_hub"
+            raise ImportError(f"{needed}: pip install 'vg2gt[hub]', or {remedy}") from error
         print(f"{name}: looking for {repo} on the hub or in its cache", file=sys.stderr)
         logging.getLogger("huggingface_hub").setLevel(logging.ERROR)  # logs several lines per attempt
         try:
-            return Path(hf_hub_download(repo, WEIGHT_FILES[0], revision=self.revision))
+            return Path(hf_hub_download(repo, WEIGHT_FILE, revision=self.revision))
         except Exception as error:  # raises its own errors and those of requests and httpx
-            raise FileNotFoundError(
-                f"cannot get {WEIGHT_FILES[0]} of {repo} (revision {self.revision or 'newest'}) for backend {name}: "
-                f"{' '.join(str(error).split()).rstrip('.')}. Check the network and the revision, or {remedy}"
-            ) from error
+            wanted = f"{WEIGHT_FILE} of {repo} (revision {self.revision or 'newest'}) for backend {name}"
+            reason = " ".join(str(error).split()).rstrip(".")
+            check = f"Check the network and the revision, or {remedy}"
+            raise FileNotFoundError(f"cannot get {wanted}: {reason}. {check}") from error
 
 
 def load_strictly(
@@ -119,21 +114,16 @@ def load_strictly(
         source: name of the file, for messages.
 
     Raises:
-        ValueError: if tensors are missing, misshapen, unexpected or not finite; names the first of them.
+        ValueError: if tensors are missing, misshapen, unexpected or not finite, naming them.
     """
-    wanted = {prefix + key: value for key, value in network.state_dict().items()}
-    complaints = []
-    for key, value in wanted.items():
-        found = state.get(key)
-        if found is None:
-            complaints.append(f"missing {key} {list(value.shape)}")
-        elif found.shape != value.shape:
-            complaints.append(f"{key} is {list(found.shape)}, expected {list(value.shape)}")
-        elif not (found.is_meta or torch.isfinite(found).all()):
-            complaints.append(f"{key} is not finite")
-    complaints += [f"unexpected {key}" for key in state if key not in wanted and not key.startswith(tuple(ignorable))]
-    if complaints:
-        more = f"; and {len(complaints) - SHOWN} more" if len(complaints) > SHOWN else ""
-        raise ValueError(f"{source} does not fit {type(network).__name__}: {'; '.join(complaints[:SHOWN])}{more}")
-    loaded = {key.removeprefix(prefix): state[key].to(value.dtype) for key, value in wanted.items()}
-    network.load_state_dict(loaded, assign=True)
+    wanted = network.state_dict()
+    found = {key: value for key, value in state.items() if not key.startswith(tuple(ignorable))}
+    found |= {prefix + name: state[prefix + name] for name in wanted if prefix + name in state}
+    wrong = [key for key, value in found.items() if not (value.is_meta or torch.isfinite(value).all())]
+    try:
+        if wrong:
+            raise RuntimeError(f"{wrong[0]} is not finite")
+        network.load_state_dict({key.removeprefix(prefix): value.float() for key, value in found.items()}, assign=True)
+    except RuntimeError as error:
+        reason = " ".join(str(error).split())
+        raise ValueError(f"{source} does not fit {type(network).__name__}: {reason[:SHOWN]}") from error

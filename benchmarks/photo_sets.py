@@ -20,8 +20,8 @@ from torch import Tensor
 from vg2gt.data.sources.colmap_model import model_folder_of
 from vg2gt.geometry.cameras import project
 from vg2gt.io import colmap_from_views, read_colmap, write_colmap
+from vg2gt.io.files import read_json
 from vg2gt.io.images import write_png
-from vg2gt.io.json_checks import load_json
 from vg2gt.reconstruction.given_cameras import LAYOUTS, given_pictures
 from vg2gt.reconstruction.inputs import load_views, working_size
 from vg2gt.reconstruction.monitor import Monitor
@@ -87,7 +87,7 @@ def prepare(photos: Path, out: Path, size: int, patch: int, poses: str) -> Photo
         titles: dict[str, str] = {}
     else:
         pictures = find_cameras(find_pictures(photos), out / "sfm", Monitor())
-        model, titles = model_folder_of(out / "sfm"), load_json(out / "sfm" / "sfm.json")["images"]
+        model, titles = model_folder_of(out / "sfm"), read_json(out / "sfm" / "sfm.json")["images"]
     views = load_views(pictures, working_size([p.size for p in pictures], patch, "cpu", size), Monitor())
     held_out = tuple(i for i in range(len(pictures)) if i % EVERY == EVERY // 2)
     context = tuple(i for i in range(len(pictures)) if i not in held_out)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import get_args
+from typing import Any, get_args
 
 import torch
 from torch import Tensor, nn
 
 from backends.da3.backbone import Backbone, ReferenceView
-from backends.dpt import DPT, decode_depth
+from backends.dpt import DPT, decode_geometry
 from backends.network import NetworkBackend, decode_pose, encode_pose, normalize_images, predict
 from backends.vit import FeedForward, ViTBlock, ViTMLP
 from backends.weights import Weights
@@ -77,19 +77,14 @@ class DA3Decoder(nn.Module):
 
     def __init__(self, token_dim: int, features: int, out_channels: Sequence[int], patch_size: int) -> None:
         super().__init__()
-        self.arguments = {
-            "token_dim": token_dim,
-            "features": features,
-            "out_channels": list(out_channels),
-            "patch_size": patch_size,
-        }
+        sizes = {"token_dim": token_dim, "features": features, "patch_size": patch_size}
+        self.arguments: dict[str, Any] = {**sizes, "out_channels": list(out_channels)}
         self.head = DPT(token_dim, features, out_channels, 2, patch_size)
         self.cam_dec = CameraDecoder(token_dim)
 
     def decode(self, tokens: Tokens, chunk: int | None) -> Geometry:
         """See :meth:`Backend.decode`; the depth head runs on at most ``chunk`` views at a time."""
-        depth, confidence = decode_depth(self.head, tokens, chunk)
-        return Geometry(depth, confidence, self.decode_cameras(tokens), torch.ones_like(depth[:, 0, 0, 0]))
+        return decode_geometry(self.head, tokens, self.decode_cameras(tokens), chunk)
 
     def decode_cameras(self, tokens: Tokens) -> Cameras:
         """See :meth:`Backend.decode_cameras`."""
@@ -126,7 +121,6 @@ class DA3Backend(NetworkBackend):
         ValueError: if the reference-view strategy is unknown.
     """
 
-    backbone_name = "backbone.pretrained"
     camera_name = "cam_dec"
     network: DA3Network
 
@@ -155,7 +149,6 @@ class DA3Backend(NetworkBackend):
         prefix: str = "model.",
         seed: int = 0,
         head_chunk: int | None = 8,
-        compile: bool = False,
         freeze: bool = True,
     ) -> None:
         if reference_view not in get_args(ReferenceView):
@@ -178,8 +171,7 @@ class DA3Backend(NetworkBackend):
         unused = (*RAY_BRANCH, "gs_head.", *(() if given_poses else ("cam_enc.",)))
         ignorable = (*(prefix + part for part in unused), *(part for part in NESTED_PARTS if part != prefix))
         weights = Weights(name, licence, pretrained, repo, revision, path, seed, prefix, ignorable)
-        given = {"needs_hints": given_poses}
-        super().__init__(make, weights, patch_size, 2 * dim, taps, head_chunk, compile, freeze, **given)
+        super().__init__(make, weights, patch_size, 2 * dim, taps, head_chunk, freeze, needs_hints=given_poses)
         self.reference_view: ReferenceView = reference_view
 
     def encode_checked(self, images: Tensor, hints: Hints | None) -> Tokens:

@@ -28,15 +28,6 @@ FARTHEST_SKY = 200.0  # metres
 SKY_CONFIDENCE = 1.0  # lower bound of DA3's confidence, 1 + exp
 
 
-class DA3MetricNetwork(nn.Module):
-    """Single-view backbone and head for depth and sky; names and shapes as published."""
-
-    def __init__(self, backbone: Backbone, head: DPT) -> None:
-        super().__init__()
-        self.backbone = nn.ModuleDict({"pretrained": backbone})
-        self.head = head
-
-
 class DA3MetricBackend(NetworkBackend):
     """DA3's metric network: predicts metric depth of single views; cameras are those of the data, confidence is 1.
 
@@ -45,7 +36,7 @@ class DA3MetricBackend(NetworkBackend):
     the arguments see :class:`NetworkBackend`; ``depth`` is the number of blocks.
     """
 
-    network: DA3MetricNetwork
+    network: nn.ModuleDict
 
     def __init__(
         self,
@@ -67,10 +58,10 @@ class DA3MetricBackend(NetworkBackend):
         seed: int = 0,
         head_chunk: int | None = 8,
     ) -> None:
-        def make() -> DA3MetricNetwork:
+        def make() -> nn.ModuleDict:
             backbone = Backbone(dim, depth, num_heads, "mlp", None, image_size, patch_size)
             head = DPT(dim, features, out_channels, 1, patch_size, normalize=False, position_weight=0, sky=True)
-            return DA3MetricNetwork(backbone, head)
+            return nn.ModuleDict({"backbone": nn.ModuleDict({"pretrained": backbone}), "head": head})
 
         ignorable = tuple(part for part in NESTED_PARTS if part != prefix)
         weights = Weights(name, licence, pretrained, repo, revision, path, seed, prefix, ignorable)
@@ -81,14 +72,14 @@ class DA3MetricBackend(NetworkBackend):
         assert hints is not None
         assert hints.cameras is not None
         with half_precision_on_gpu(images):
-            patch, camera = self.network.backbone["pretrained"](normalize_images(images), self.taps)
+            patch, camera = self.network.get_submodule("backbone.pretrained")(normalize_images(images), self.taps)
         tokens = self.as_tokens(images, patch, camera)
         return replace(tokens, state={"cameras": hints.cameras, "factor": metres(hints.cameras)})
 
     def decode_raw(self, tokens: Tokens) -> tuple[Tensor, Tensor]:
         """Returns the network's depth, before filling the sky, and its sky score, both ``[B, V, H, W]``."""
         with full_precision(tokens.camera):
-            out = in_chunks(self.network.head, tokens.patch, tokens.grid, self.head_chunk)
+            out = in_chunks(self.network["head"], tokens.patch, tokens.grid, self.head_chunk)
         return out[:, :, 0].exp(), F.relu(out[:, :, 1])
 
     def decode(self, tokens: Tokens) -> Geometry:
@@ -107,7 +98,7 @@ def metres(cameras: Cameras) -> Tensor:
 
 
 def fill_sky(depth: Tensor, sky: Tensor) -> Tensor:
-    """Sets the depth of sky pixels to the 0.99 quantile of the scene's other pixels.
+    """Sets the depth of sky pixels to the far end of their scene.
 
     Scenes with at most ten sky pixels, or at most ten others, are left unchanged. The published code takes the quantile
     over the whole batch, which is the same for one scene at a time.
@@ -116,12 +107,9 @@ def fill_sky(depth: Tensor, sky: Tensor) -> Tensor:
         depth: ``[B, V, H, W]``.
         sky: sky score ``[B, V, H, W]``; sky from 0.3 on.
     """
-    filled = []
-    for scene, mask in zip(depth, sky >= SKY_THRESHOLD, strict=True):
-        ground = scene[~mask]
-        enough = ground.numel() > MIN_PIXELS and mask.sum() > MIN_PIXELS
-        filled.append(torch.where(mask, quantile(ground, FAR_QUANTILE), scene) if enough else scene)
-    return torch.stack(filled)
+    far, is_sky = far_ends(depth, sky)[:, None, None, None], sky >= SKY_THRESHOLD
+    enough = is_sky.sum((1, 2, 3), keepdim=True) > MIN_PIXELS
+    return torch.where(is_sky & enough & far.isfinite(), far, depth)
 
 
 def quantile(values: Tensor, q: float) -> Tensor:
@@ -157,8 +145,8 @@ class DA3NestedBackend(Backend):
         metric_tokens = self.metric.encode(images, Hints(cameras=geometry.cameras))
         depth, sky = self.metric.decode_raw(metric_tokens)
         scale = fit_scale(depth * metres(geometry.cameras)[..., None, None], sky, geometry)
-        state = {"scale": scale, "sky": sky >= SKY_THRESHOLD, "far": far_ends(geometry.depth, sky, scale)}
-        return replace(tokens, state={**tokens.state, **state})
+        far = torch.minimum(far_ends(geometry.depth, sky), FARTHEST_SKY / scale)
+        return replace(tokens, state={**tokens.state, "scale": scale, "sky": sky >= SKY_THRESHOLD, "far": far})
 
     def decode(self, tokens: Tokens) -> Geometry:
         """See :meth:`Backend.decode`."""
@@ -182,23 +170,14 @@ class DA3NestedBackend(Backend):
         return self.relative.predict_cameras(images, hints)
 
 
-def far_ends(depth: Tensor, sky: Tensor, scale: Tensor) -> Tensor:
-    """Returns the depth of each scene's sky: the 0.99 quantile of its other pixels, at most 200 m.
+def far_ends(depth: Tensor, sky: Tensor) -> Tensor:
+    """Returns the far end of each scene, ``[B]``: the 0.99 quantile of the pixels that are not sky.
 
-    Args:
-        depth: ``[B, V, H, W]``.
-        sky: sky score ``[B, V, H, W]``; sky from 0.3 on.
-        scale: metres per unit of ``depth``, ``[B]``.
-
-    Returns:
-        ``[B]``, in the unit of ``depth``; infinity for a scene with at most ten pixels that are not sky.
+    It is NaN for a scene with at most ten such pixels. Arguments as of :func:`fill_sky`.
     """
-    ends = torch.full_like(scale, torch.inf)
-    for index, (scene, score) in enumerate(zip(depth, sky, strict=True)):
-        ground = scene[score < SKY_THRESHOLD]
-        if ground.numel() > MIN_PIXELS:
-            ends[index] = torch.minimum(quantile(ground, FAR_QUANTILE), FARTHEST_SKY / scale[index])
-    return ends
+    ground = [scene[score < SKY_THRESHOLD] for scene, score in zip(depth, sky, strict=True)]
+    unknown = depth.new_tensor(torch.nan)
+    return torch.stack([quantile(g, FAR_QUANTILE) if len(g) > MIN_PIXELS else unknown for g in ground])
 
 
 def fit_scale(metric_depth: Tensor, sky: Tensor, geometry: Geometry) -> Tensor:

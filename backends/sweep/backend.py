@@ -22,8 +22,8 @@ SHIPPED = Path(__file__).parent / "weights" / "sweep.safetensors"
 LICENCE = "Apache-2.0"
 _CONFIDENCE = (0.37, 400.0)  # bounds of 1 / expected relative error
 _NO_PARALLAX = (
-    "backend sweep estimates depth from parallax, but {why}: take photos from different positions, or choose a "
-    "single-image backend (backend=vggt_1b, backend=da3_small, ...)"
+    "backend sweep estimates depth from parallax, but got a single view, or all cameras are at the same position: take "
+    "photos from different positions, or choose a single-image backend (backend=vggt_1b, backend=da3_small, ...)"
 )
 
 
@@ -53,7 +53,7 @@ class SweepBackend(Backend):
     ) -> None:
         if planes < 8 or sources < 1:
             raise ValueError(f"backend.planes must be >= 8 and backend.sources >= 1, got {planes} and {sources}")
-        super().__init__("sweep", PATCH, (DIM,) * TAPS, LICENCE, needs_hints=True, min_views=2, predicts_cameras=False)
+        super().__init__("sweep", PATCH, (DIM,) * TAPS, LICENCE, needs_hints=True, predicts_cameras=False)
         weights = Weights(
             self.name, LICENCE, pretrained, None, None, path or (str(SHIPPED) if pretrained else None), seed
         )
@@ -76,9 +76,8 @@ class SweepBackend(Backend):
         with full_precision(images):
             for scene, pictures in enumerate(images.float()):
                 views = PosedViews(pictures, cameras.world_to_camera[scene], cameras.intrinsics[scene])
-                if len(pictures) < self.min_views or not (camera_distances(views.world_to_camera) > 0).any():
-                    why = "got a single view" if len(pictures) == 1 else "all cameras are at the same position"
-                    raise ValueError(_NO_PARALLAX.format(why=why))
+                if not (camera_distances(views.world_to_camera) > 0).any():
+                    raise ValueError(_NO_PARALLAX)
                 features = self.network.features(pictures)
                 hint = None if hints.depth_range is None else hints.depth_range[scene].float()
                 depth_range = self.network.find_range(features, views, self.sources, hint)

@@ -15,6 +15,7 @@ from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.types import Cameras, Hints
 
 BUILT_IN = ("oracle", "sweep", "vggt_tiny", "da3_tiny", "onnx")
+EXAMPLE = "examples.backend.LocalDepthBackend"
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -24,7 +25,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     if "backend" in metafunc.fixturenames:
         chosen = metafunc.config.getoption("--backend", default=None)
-        metafunc.parametrize("backend", [chosen] if chosen else BUILT_IN, indirect=True, scope="session")
+        metafunc.parametrize("backend", [chosen] if chosen else [*BUILT_IN, EXAMPLE], indirect=True, scope="session")
 
 
 @pytest.fixture(scope="session")

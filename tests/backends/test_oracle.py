@@ -1,6 +1,5 @@
 from dataclasses import replace
 
-import pytest
 import torch
 
 from backends.oracle import OracleBackend
@@ -73,19 +72,6 @@ def test_invalid_depth_stays_invalid(make_scene) -> None:
     assert geometry.depth_conf[depth == 0].max() < 0.01
     assert geometry.depth_conf[depth > 0].min() > 1
     assert all(torch.isfinite(patch).all() for patch in tokens.patch)
-
-
-def test_the_background_lies_behind_the_scene(make_scene) -> None:
-    images, hints = make_scene(1, 2, SIZE)
-    depth = hints.depth.clone()
-    depth[..., :20, :] = 0
-    given = replace(hints, depth=depth)
-    geometry, plain = simulate(images, given, background=1.5), simulate(images, given)
-    assert torch.equal(geometry.depth[depth > 0], plain.depth[depth > 0])
-    assert torch.equal(geometry.depth_conf, plain.depth_conf)
-    torch.testing.assert_close(geometry.depth[depth == 0], torch.full((2 * 20 * SIZE[1],), 1.5 * float(depth.max())))
-    with pytest.raises(ValueError, match=r"backend\.background must be at least 1"):
-        OracleBackend(background=0.5)
 
 
 def test_tokens_do_not_know_the_truth(make_scene) -> None:

@@ -116,7 +116,7 @@ def test_depth_is_in_the_unit_of_the_cameras_and_those_in_one_place_are_refused(
     large = backend.decode(backend.encode(images, given)).depth
     torch.testing.assert_close(large / 1000, depth, rtol=2e-2, atol=0)
     given.cameras.world_to_camera[..., :3, 3] = 0
-    with pytest.raises(ValueError, match="parallax, but all cameras are at the same position"):
+    with pytest.raises(ValueError, match=r"parallax, but .* all cameras are at the same position"):
         backend.encode(images, given)
 
 

@@ -21,7 +21,7 @@ def donor(make_backend):
     return make_backend("da3_tiny", "seed=5")
 
 
-@pytest.mark.parametrize("name", ["model.safetensors", "model.pt", "other.safetensors"])
+@pytest.mark.parametrize("name", ["model.safetensors", "other.pt"])
 def test_weights_are_loaded_from_file_or_folder(tmp_path: Path, make_backend, donor, capsys, name: str) -> None:
     state = published(donor) | {"model.head.scratch.output_conv1_aux.0.0.weight": torch.zeros(1)}
     file = tmp_path / name
@@ -53,7 +53,7 @@ def test_offending_tensors_are_named() -> None:
     with pytest.raises(ValueError, match="does not fit Sequential") as caught:
         load_strictly(network, state, "model.", ("model.unused.",), "some.pt")
     message = str(caught.value)
-    for said in ("some.pt", "missing model.1.bias [1]", "model.0.weight is [3, 4], expected [3, 2]", "model.2.weight"):
+    for said in ("some.pt", 'Missing key(s) in state_dict: "1.bias"', "size mismatch for 0.weight", '"2.weight"'):
         assert said in message
     assert "unused" not in message
     state = {"weight": torch.zeros(2, 2), "bias": torch.tensor([0, torch.nan])}

@@ -48,7 +48,7 @@ def test_views_become_records_and_back() -> None:
         ("name", "", "name is '', expected"),
         ("width", 0, "width is 0, expected"),
         ("height", 2.5, "height is 2.5, expected"),
-        ("width", 1_000_000, "has 1000000x640 pixels, more than 268435456"),
+        ("width", 1_000_000, "width is 1000000, expected"),
         ("intrinsics", None, "intrinsics is missing, expected 3 rows"),
         ("intrinsics", [[1, 2], [3]], "expected 3 rows"),
         ("intrinsics", [[-5, 0, 1], [0, 5, 1], [0, 0, 1]], "positive focal"),

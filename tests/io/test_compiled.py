@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from numba.core.dispatcher import Dispatcher
 
 from tests.commands import ROOT
 from vg2gt.kernels import compiled
@@ -126,45 +125,24 @@ def test_kernels_take_what_they_need_from_their_own_room() -> None:
     wrong, kernels = [], 0
     shared = ".".join(compiled.SHARED.relative_to(ROOT).with_suffix("").parts)
     for path in (ROOT / "vg2gt").rglob("*.py"):
-        source = path.read_text()
-        tree = ast.parse(source)
-        imported = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
-        if path.name != "compiled.py" and "cache=True" in source and "numba" in source:
-            wrong.append(f"{path}: njit(cache=True)")
-        if not any(name.name in ("kernel", "kernel_part", "jit", "part") for node in imported for name in node.names):
+        tree = ast.parse(path.read_text())
+        imported = {
+            alias.asname or alias.name: f"{node.module}."
+            for node in ast.walk(tree)
+            if isinstance(node, ast.ImportFrom)
+            for alias in node.names
+        }
+        if not {"kernel", "kernel_part", "jit", "part"} & imported.keys():
             continue
         kernels += 1
-        room = ".".join(path.relative_to(ROOT).parts[:2])
-        compiled_names = {
-            name.id
-            for function in ast.walk(tree)
-            if isinstance(function, ast.FunctionDef)
-            and any("kernel" in (d := ast.unparse(x)) or d in ("jit", "part") for x in function.decorator_list)
-            for name in ast.walk(function)
-            if isinstance(name, ast.Name)
-        }
-        wrong += [
-            f"{path}: {name.name} of {node.module}"
-            for node in imported
-            for name in node.names
-            if (name.asname or name.name) in compiled_names - {"kernel", "kernel_part"}
-            and (node.module or "").startswith("vg2gt.")
-            and not f"{node.module}.".startswith(f"{room}.")
-            and node.module != shared
-        ]
+        own = (".".join(path.relative_to(ROOT).parts[:2]) + ".", f"{shared}.")
+        for function in ast.walk(tree):
+            if isinstance(function, ast.FunctionDef) and any(
+                "kernel" in (name := ast.unparse(decorator)) or name in ("jit", "part")
+                for decorator in function.decorator_list
+            ):
+                used = {node.id for body in function.body for node in ast.walk(body) if isinstance(node, ast.Name)}
+                modules = {imported[name] for name in used & imported.keys()}
+                wrong += [f"{path}: {m}" for m in modules if m.startswith("vg2gt.") and not m.startswith(own)]
     assert kernels >= 9
     assert not wrong
-
-
-def test_kernels_made_in_functions_are_found_again_by_other_processes() -> None:
-    """A kernel in a closure has another key in every process, which would compile it again and leave one more file."""
-    made = [
-        kernel
-        for path in sorted((*ROOT.glob("vg2gt/**/*.py"), *ROOT.glob("backends/**/*.py")))
-        if "import kernel" in path.read_text()
-        for kernel in vars(importlib.import_module(".".join(path.relative_to(ROOT).with_suffix("").parts))).values()
-        if isinstance(kernel, Dispatcher) and kernel.py_func.__closure__
-    ]
-    assert len(made) >= 6
-    for kernel in made:
-        assert all(isinstance(cell.cell_contents, bool) for cell in kernel.py_func.__closure__), kernel

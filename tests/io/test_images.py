@@ -77,15 +77,11 @@ def test_a_mask_of_stored_pixels_is_turned_with_its_photograph(tmp_path: Path) -
 RAMP = np.linspace(0, 65535, 24 * 32).reshape(24, 32)
 
 
-@pytest.mark.parametrize("suffix", ["png", "tif", "pgm"])
+@pytest.mark.parametrize("suffix", ["png", "tif"])
 def test_16_bit_grey_photographs_keep_their_greys(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"photo.{suffix}"
-    if suffix == "pgm":  # which Pillow writes of 16 bits since version 11 only
-        path.write_bytes(b"P5 32 24 65535\n" + RAMP.astype(">u2").tobytes())
-    else:
-        Image.fromarray(RAMP.astype(np.uint16)).save(path)
-    pixels = read_color(path, "scene")
-    assert np.abs(pixels - RAMP[..., None] / 257).max() <= 0.51
+    Image.fromarray(RAMP.astype(np.uint16)).save(path)
+    assert np.abs(read_color(path, "scene") - RAMP[..., None] / 257).max() <= 0.51
 
 
 @pytest.mark.parametrize(("dtype", "kind"), [(np.int32, "32-bit integers"), (np.float32, "floating-point numbers")])

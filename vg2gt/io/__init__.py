@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from vg2gt.io.mesh import Mesh, fuse_depth, write_mesh
     from vg2gt.io.nerfstudio import Lens, Transforms, TransformsFrame, read_transforms, write_transforms
     from vg2gt.io.ply import read_gaussian_ply, write_gaussian_ply
-    from vg2gt.io.points import write_glb, write_point_ply
+    from vg2gt.io.points import write_point_ply
     from vg2gt.io.spz import read_spz, write_spz
     from vg2gt.io.video import read_video, write_video
 
@@ -33,7 +33,7 @@ _NAMES = {
     "mesh": "Mesh fuse_depth write_mesh",
     "nerfstudio": "Lens Transforms TransformsFrame read_transforms write_transforms",
     "ply": "read_gaussian_ply write_gaussian_ply",
-    "points": "write_glb write_point_ply",
+    "points": "write_point_ply",
     "spz": "read_spz write_spz",
     "video": "read_video write_video",
 }

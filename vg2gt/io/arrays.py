@@ -6,7 +6,6 @@ shape.
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import BinaryIO
@@ -19,12 +18,13 @@ from vg2gt.io.files import regular
 from vg2gt.io.image_files import Size, check_size
 
 
-def read_npz(file: str | Path | BinaryIO, names: Sequence[str]) -> dict[str, NDArray]:
+def read_npz(file: str | Path | BinaryIO, names: Sequence[str], optional: Sequence[str] = ()) -> dict[str, NDArray]:
     """Reads named arrays of an ``.npz`` archive without executing anything in it.
 
     Args:
         file: a path, or an open file.
         names: names of the arrays to read.
+        optional: names of arrays to read if the archive has them.
 
     Raises:
         KeyError: if an array is missing, naming it.
@@ -37,24 +37,11 @@ def read_npz(file: str | Path | BinaryIO, names: Sequence[str]) -> dict[str, NDA
         with np.load(file, allow_pickle=False) as stored:
             if not isinstance(stored, np.lib.npyio.NpzFile):
                 raise FormatError("it is a single array, not an archive")
-            return {name: stored[name] for name in names}
+            return {name: stored[name] for name in (*names, *(name for name in optional if name in stored.files))}
     except (OSError, KeyError, FormatError):
         raise
     except Exception as error:  # damaged files raise various errors of zipfile, zlib and parser, or MemoryError
         raise FormatError(f"not a readable archive of plain arrays: {error or type(error).__name__}") from error
-
-
-def npz_names(path: Path) -> tuple[str, ...]:
-    """Returns the names of the arrays in an ``.npz`` file.
-
-    Raises:
-        FormatError: if it is not an archive.
-    """
-    try:
-        with zipfile.ZipFile(regular(path)) as archive:
-            return tuple(name.removesuffix(".npy") for name in archive.namelist())
-    except zipfile.BadZipFile as error:
-        raise FormatError(f"not a readable archive of plain arrays: {error}") from error
 
 
 def load_npz(path: Path, scene: str, names: Sequence[str]) -> dict[str, NDArray]:
@@ -85,10 +72,8 @@ def load_matrices(
         )
         if not fits or array.dtype.kind not in "fiu":
             expected = "x".join("N" if size is None else str(size) for size in shape)
-            raise DataError(
-                f"{name} in {path} of scene {scene} must hold {expected} numbers, not {array.dtype} of shape "
-                f"{array.shape}"
-            )
+            found = f"{array.dtype} of shape {array.shape}"
+            raise DataError(f"{name} in {path} of scene {scene} must hold {expected} numbers, not {found}")
     return {name: arrays[name].astype(np.float64) for name in shapes}
 
 

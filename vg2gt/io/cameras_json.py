@@ -2,15 +2,17 @@
 
 The file is a list of objects ``name``, ``width``, ``height``, ``intrinsics`` (3 rows of 3, integer pixel centres) and
 ``world_to_camera`` (4 rows of 4, OpenCV axes). A reconstruction adds ``photo`` (the whole photograph's camera),
-``similarity`` (4 rows of 4, transform from this file's world to that of the given or estimated cameras) and
-``metres_per_unit`` (null: unknown). Other fields are ignored. The file of the same name from 3D Gaussian Splatting has
-other fields; it is refused, naming the missing one.
+``similarity`` (4 rows of 4, transform from this file's world to that of the given or estimated cameras) and, if known,
+``metres_per_unit``. Other fields are ignored. The file of the same name from 3D Gaussian Splatting has other fields; it
+is refused, naming the missing one.
 """
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +21,10 @@ import torch
 from numpy.typing import NDArray
 
 from vg2gt.io.errors import FormatError
-from vg2gt.io.files import write_json
-from vg2gt.io.json_checks import Fields, check_rigid, load_json
+from vg2gt.io.files import read_json, write_json
 from vg2gt.types import Cameras
 
-MOST_PIXELS = 1 << 28  # per image to render; the largest photographs have fewer
+MAX_SIZE = 1 << 16  # pixels along an image's side
 _ROTATION_TOLERANCE = 1e-3
 
 
@@ -77,22 +78,8 @@ class NamedCamera:
 
     def fields(self) -> dict[str, Any]:
         """Returns the camera as the plain values of its JSON object."""
-        fields: dict[str, Any] = {
-            "name": self.name,
-            "width": int(self.width),
-            "height": int(self.height),
-            "intrinsics": np.asarray(self.intrinsics, np.float64).tolist(),
-            "world_to_camera": np.asarray(self.world_to_camera, np.float64).tolist(),
-        }
-        if self.photo is not None:
-            photo = self.photo
-            intrinsics = np.asarray(photo.intrinsics, np.float64).tolist()
-            size = {"name": photo.name, "width": int(photo.width), "height": int(photo.height)}
-            fields["photo"] = {**size, "intrinsics": intrinsics, "lens": photo.lens}
-        if self.similarity is not None:
-            fields["similarity"] = np.asarray(self.similarity, np.float64).tolist()
-            fields["metres_per_unit"] = self.metres_per_unit
-        return fields
+        plain = json.loads(json.dumps(asdict(self), default=lambda values: values.tolist()))
+        return {name: value for name, value in plain.items() if value is not None}
 
 
 def invert_pose(pose: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -113,9 +100,7 @@ def named_cameras(cameras: Cameras, names: Sequence[str]) -> list[NamedCamera]:
     """
     scenes, views = cameras.world_to_camera.shape[:2]
     if scenes != 1 or views != len(names):
-        raise ValueError(
-            f"expected one scene and one name per view, got {scenes} scenes, {views} views, {len(names)} names"
-        )
+        raise ValueError(f"expected 1 scene and a name per view, got {scenes}, {views} views, {len(names)} names")
     poses, intrinsics = (t[0].detach().cpu().double().numpy() for t in (cameras.world_to_camera, cameras.intrinsics))
     height, width = cameras.size
     return [NamedCamera(name, width, height, k, pose) for name, k, pose in zip(names, intrinsics, poses, strict=True)]
@@ -140,7 +125,7 @@ def read_cameras_json(path: str | Path) -> list[NamedCamera]:
         FormatError: if the file is not JSON or a field is wrong, naming the file, the entry and the field.
     """
     path = Path(path)
-    content = load_json(path)
+    content = read_json(path)
     if not isinstance(content, list):
         raise FormatError(f"{path}: expected a list of cameras, got {type(content).__name__}")
     return [_camera(f"{path}: [{index}]", entry) for index, entry in enumerate(content)]
@@ -158,10 +143,8 @@ def _camera(place: str, entry: Any) -> NamedCamera:
     photo = entry.get("photo")
     if photo is not None:
         inside = Fields(f"{place}.photo.", photo)
-        names = [inside.get(key, str, "a text") for key in ("name", "lens")]
-        if None in names:
-            raise inside.wrong("name" if names[0] is None else "lens", "a text")
-        photo = Photo(names[0], *_optics(inside), names[1])
+        title, lens = (inside.get(key, str, "a text", required=True) for key in ("name", "lens"))
+        photo = Photo(title, *_optics(inside), lens)
     similarity = None if entry.get("similarity") is None else _matrix(fields, "similarity", 4)
     metres = fields.number("metres_per_unit", 0, 1e30)
     return NamedCamera(name, width, height, intrinsics, pose, photo, similarity, metres)
@@ -172,15 +155,8 @@ def _optics(fields: Fields) -> tuple[int, int, NDArray[np.float64]]:
     intrinsics = _matrix(fields, "intrinsics", 3)
     focal = intrinsics[[0, 1], [0, 1]]
     if (focal <= 0).any() or np.abs(intrinsics[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]] - [0, 0, 0, 0, 1]).max() > 1e-9:
-        raise FormatError(
-            f"{fields.place}intrinsics is {intrinsics.tolist()}, expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with "
-            "positive focal lengths and no skew; undistort the images"
-        )
-    width, height = fields.pixels("width"), fields.pixels("height")
-    if width is None or height is None:
-        raise fields.wrong("width" if width is None else "height", "a whole number of pixels")
-    if width * height > MOST_PIXELS:
-        raise FormatError(f"{fields.place[:-1]} has {width}x{height} pixels, more than {MOST_PIXELS} in all")
+        raise fields.wrong("intrinsics", "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive focal lengths, no skew")
+    width, height = (fields.pixels(name, required=True) or 0 for name in ("width", "height"))
     return width, height, intrinsics
 
 
@@ -189,3 +165,71 @@ def _matrix(fields: Fields, name: str, size: int) -> NDArray[np.float64]:
     if not np.isfinite(matrix).all():
         raise fields.wrong(name, f"{size} rows of {size} finite numbers")
     return matrix
+
+
+class Fields:
+    """The fields of one JSON object; every error (``FormatError``) names the place and the field.
+
+    Args:
+        place: prefix of field names in messages, such as ``cameras.json: [1].``.
+        content: the parsed object.
+    """
+
+    def __init__(self, place: str, content: Any) -> None:
+        if not isinstance(content, dict):
+            raise FormatError(f"{place.rstrip('.: ')} should be an object, got {short(content)}")
+        self.place, self.content = place, content
+
+    def wrong(self, name: str, expected: str) -> FormatError:
+        """Returns the error for a field that is missing or not as expected."""
+        return FormatError(f"{self.place}{name} is {short(self.content.get(name))}, expected {expected}")
+
+    def get(self, name: str, kind: type, expected: str, required: bool = False) -> Any:
+        """Returns a field of type ``kind``; None if it is missing, unless ``required``."""
+        value = self.content.get(name)
+        if not isinstance(value, kind) and (required or value is not None):
+            raise self.wrong(name, expected)
+        return value
+
+    def number(self, name: str, low: float = -math.inf, high: float = math.inf) -> float | None:
+        """Returns a finite number strictly between ``low`` and ``high``; None if it is missing."""
+        value = self.content.get(name)
+        if value is None:
+            return None
+        if type(value) not in (int, float) or abs(value) > 1e300 or not low < value < high:
+            limits = "" if low == -math.inf else f" greater than {low:g}" + (f" and below {high:g}" * (high < math.inf))
+            raise self.wrong(name, f"a finite number{limits}")
+        return float(value)
+
+    def pixels(self, name: str, required: bool = False) -> int | None:
+        """Returns a whole number of pixels; None if it is missing and not ``required``."""
+        value = self.number(name, 0, MAX_SIZE)
+        if (required and value is None) or (value is not None and value != round(value)):
+            raise self.wrong(name, "a whole number of pixels")
+        return None if value is None else round(value)
+
+    def matrix(self, name: str, rows: Sequence[int], columns: int) -> NDArray[np.float64]:
+        """Returns a matrix whose number of rows is one of ``rows``; its values may be NaN or infinite."""
+        value = self.content.get(name)
+        lists = value if isinstance(value, list) and len(value) in rows else [None]
+        try:
+            if all(isinstance(row, list) and all(type(number) in (int, float) for number in row) for row in lists):
+                return np.array(lists, np.float64).reshape(len(lists), columns)
+        except (ValueError, OverflowError):
+            pass
+        raise self.wrong(name, f"{' or '.join(map(str, rows))} rows of {columns} finite numbers")
+
+
+def check_rigid(place: str, matrix: NDArray[np.float64], tolerance: float) -> None:
+    """Checks that a finite ``[4, 4]`` matrix is a rotation, orthonormal within ``tolerance``, and a translation."""
+    rotation = matrix[:3, :3]
+    error = np.abs(rotation.T @ rotation - np.eye(3)).max() if np.abs(rotation).max() < 2 else math.inf
+    if error > tolerance or np.linalg.det(rotation) < 0 or np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
+        what = f"is not a rotation and a translation (R'R differs from the identity by {error:.2g})"
+        raise FormatError(f"{place} {what}; remove scale, shear and mirroring")
+
+
+def short(value: Any) -> str:
+    """Formats a value for a message, in at most 80 characters."""
+    text = type(value).__name__ if isinstance(value, dict | list) else "missing" if value is None else repr(value)
+    return text if len(text) <= 80 else text[:77] + "..."

@@ -34,8 +34,8 @@ Camera: TypeAlias = Any
 
 PIXEL_CENTER = 0.5  # centre of the first pixel in COLMAP; ours is at 0
 FILES = ("cameras", "images", "points3D")
-_NOT_FINITE = re.compile(r"[+-]?(nan(\(.*\))?|inf(inity)?|1\.#\w+)", re.IGNORECASE)
-_FAR = 1e30
+_NOT_FINITE = re.compile(r"[\s-](nan|inf)\b", re.IGNORECASE)
+_FAR = 1e30  # larger values are as senseless as those that are not finite
 EXTRA = "pip install 'vg2gt[colmap]'"
 
 
@@ -55,11 +55,10 @@ def require_pycolmap(purpose: str) -> None:
 def colmap_files(folder: Path) -> dict[str, Path]:
     """Finds the model's files, by the names in ``FILES``; empty if the folder holds no model.
 
-    ``.bin`` takes precedence over ``.txt``. Case is ignored, and ``points3D`` may be missing.
+    ``.bin`` takes precedence over ``.txt``. ``points3D`` may be missing.
     """
-    found = {path.name.lower(): path for path in sorted(folder.iterdir())} if folder.is_dir() else {}
     for ending in (".bin", ".txt"):
-        files = {name: found[f"{name.lower()}{ending}"] for name in FILES if f"{name.lower()}{ending}" in found}
+        files = {name: path for name in FILES if (path := folder / f"{name}{ending}").exists()}
         if "cameras" in files and "images" in files:
             return files
     return {}
@@ -73,34 +72,42 @@ def read_colmap(folder: str | Path) -> Reconstruction:
             ``frames`` of newer versions repeat the poses and are not read.
 
     Returns:
-        The model. Poses and points that are not finite in the files are NaN or at least 1e30, see
-        :func:`colmap_pose`. If a parameter of a camera is not finite, all its parameters are 0, see
-        :func:`colmap_intrinsics`.
+        The model.
 
     Raises:
-        FormatError: if there is no model, or a file is damaged, naming the file.
+        FormatError: if there is no model, or a file is damaged or has values that are not finite, naming the file.
         ImportError: if pycolmap is not installed.
     """
     folder = Path(folder)
     files = colmap_files(folder)
     if not files:
-        raise FormatError(
-            f"{folder}: no COLMAP model here, expected {', '.join(FILES)} all as .bin or all as .txt; give the model's "
-            "own folder, usually sparse/0"
-        )
+        kinds = f"{', '.join(FILES)} all as .bin or all as .txt"
+        raise FormatError(f"{folder}: no COLMAP model here, expected {kinds}; its folder is usually sparse/0")
     require_pycolmap(f"reading the COLMAP model {folder}")
     import pycolmap  # pyright: ignore[reportMissingImports]
 
+    ending = files["cameras"].suffix
     with tempfile.TemporaryDirectory(prefix="vg2gt-colmap-") as temporary, quiet_colmap():
         for name in FILES:
-            _stage(name, files.get(name), Path(temporary), files["cameras"].suffix.lower())
+            target = Path(temporary, f"{name}{ending}")
+            if name not in files:
+                target.write_bytes(bytes(8) if ending == ".bin" else b"")  # no points
+                continue
+            target.symlink_to(regular(files[name]).resolve())
+            if ending == ".bin":
+                _check_records(name, files[name])
         try:
             model = pycolmap.Reconstruction(temporary)
+            senseless = _senseless(model)
         except (ValueError, IndexError, KeyError, RuntimeError, MemoryError) as error:
-            raise FormatError(f"{folder}: damaged COLMAP model ({_reason(error)})") from error
-    empty = [camera.camera_id for camera in model.cameras.values() if not camera.width * camera.height]
-    if empty:
-        raise FormatError(f"{files['cameras']}: camera {empty[0]} has images without pixels; the file is damaged")
+            texts = {path: path.read_text(errors="replace") for path in files.values() if path.suffix == ".txt"}
+            not_finite = [path for path, text in texts.items() if _NOT_FINITE.search(text)]
+            where = f"{not_finite[0]}: values that are not finite" if not_finite else f"{folder}: damaged COLMAP model"
+            raise FormatError(f"{where} ({' '.join(str(error).split())[:200]})") from error
+    for name, numbers in senseless.items():
+        if numbers:
+            what = f"number {numbers[0]} has values that are not finite or make no sense"
+            raise FormatError(f"{files[name]}: {what}; correct or remove it, or export the model again")
     return model
 
 
@@ -128,31 +135,19 @@ def colmap_images(model: Reconstruction) -> list[Image]:
 def colmap_intrinsics(camera: Camera) -> NDArray[np.float64]:
     """Returns a camera's pinhole intrinsics ``[3, 3]`` in pixels, with our integer pixel centres, without distortion.
 
-    All NaN if a parameter in the file is not finite.
-
     Raises:
         ValueError: if the camera model has no focal length (EQUIRECTANGULAR).
     """
     if not len(camera.focal_length_idxs()):
-        raise ValueError(
-            f"camera {camera.camera_id}: {camera.model_name} has no pinhole equivalent; convert images to cube faces"
-        )
-    if not np.any(camera.params):
-        return np.full((3, 3), np.nan)
+        raise ValueError(f"{camera.model_name} has no pinhole equivalent; convert images to cube faces")
     matrix = np.array(camera.calibration_matrix(), np.float64)
     matrix[:2, 2] -= PIXEL_CENTER
     return matrix
 
 
 def colmap_pose(image: Image) -> NDArray[np.float64]:
-    """Returns ``world_to_camera`` ``[4, 4]`` of an image; all NaN if it has no pose or a value is not finite."""
-    pose = np.full((4, 4), np.nan)
-    if image.has_pose:
-        rigid = np.asarray(image.cam_from_world().matrix(), np.float64)
-        turn = np.linalg.norm(image.cam_from_world().rotation.quat)
-        if (np.abs(rigid) < _FAR).all() and turn > 0.5:
-            pose = np.vstack((rigid, [0, 0, 0, 1]))
-    return pose
+    """Returns ``world_to_camera`` ``[4, 4]`` of an image."""
+    return np.vstack((image.cam_from_world().matrix(), [0, 0, 0, 1]))
 
 
 def colmap_from_views(
@@ -188,7 +183,10 @@ def colmap_from_views(
             f"{list(poses.shape[:2])}; use Cameras.scene"
         )
     xyz, rgb = checked_points(np.zeros((0, 3)) if positions is None else positions, colors)
-    owner, view_of, pixels = _observations(sources, len(xyz), len(names))
+    nothing = np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2))
+    owner, view_of, pixels = (np.asarray(part) for part in sources or nothing)
+    if view_of.shape != owner.shape or pixels.shape != (len(owner), 2):
+        raise ValueError(f"sources must be [T], [T] and [T, 2], got {owner.shape}, {view_of.shape}, {pixels.shape}")
     tracks = [pycolmap.Track() for _ in xyz]
     model = pycolmap.Reconstruction()
     for view, name in enumerate(names):
@@ -221,121 +219,46 @@ def quiet_colmap() -> Iterator[None]:
         pycolmap.logging.minloglevel = before
 
 
-def _observations(sources: Any, points: int, views: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray]:
-    if sources is None:
-        return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2))
-    owner, view, pixels = (np.asarray(part) for part in sources)
-    count = len(owner)
-    inside = count == 0 or (owner.min() >= 0 and owner.max() < points and view.min() >= 0 and view.max() < views)
-    if owner.shape != (count,) or view.shape != (count,) or pixels.shape != (count, 2) or not inside:
-        raise ValueError(
-            f"sources must be points [T] below {points}, views [T] below {views} and pixels [T, 2], got shapes "
-            f"{owner.shape}, {view.shape}, {pixels.shape}"
-        )
-    return owner.astype(np.int64), view.astype(np.int64), pixels.astype(np.float64)
+def _senseless(model: Reconstruction) -> dict[str, list[int]]:
+    """Numbers of the cameras, images and points whose values are not finite or make no sense, by file."""
+
+    def sound(values: Any) -> bool:
+        return bool((np.abs(values) < _FAR).all())
+
+    poses = {number: image.cam_from_world() for number, image in model.images.items() if image.name}
+    posed = {n for n, pose in poses.items() if sound(pose.matrix()) and np.linalg.norm(pose.rotation.quat) > 0.5}
+    return {
+        "cameras": [n for n, c in model.cameras.items() if not (c.width * c.height and sound(c.params))],
+        "images": [number for number in model.images if number not in posed],
+        "points3D": [number for number, point in model.points3D.items() if not sound(point.xyz)],
+    }
 
 
-def _stage(name: str, path: Path | None, folder: Path, ending: str) -> None:
-    """Checks one file and puts it, cleaned if needed, into the folder that pycolmap reads."""
-    target = folder / f"{name}{ending}"
-    if path is None:  # a model without points
-        target.write_bytes(bytes(8) if ending == ".bin" else b"")
-    elif ending == ".bin":
-        data = _checked(name, path)
-        if name == "cameras":
-            target.write_bytes(data)
-        else:
-            target.symlink_to(path.resolve())
-    else:
-        try:
-            text = regular(path).read_text(encoding="utf-8-sig")
-        except UnicodeDecodeError as error:
-            raise FormatError(f"{path}: not UTF-8 text ({error}); the file is damaged or not a text model") from error
-        if name == "cameras" or re.search(r"(?i)[\s-](nan|inf)\b", text):
-            text = "\n".join(_clean_line(name, line) for line in text.split("\n"))
-        target.write_text(text, encoding="utf-8")
-
-
-def _clean_line(name: str, line: str) -> str:
-    """Makes a line readable by pycolmap: camera models in upper case, placeholders for values that are not finite.
-
-    All parameters of such a camera become 0. Such images and points are moved so far away that they count as unknown.
-    """
-    fields = line.split(" ") if name == "images" else line.split()
-    if not fields or fields[0].startswith("#"):
-        return line
-    spoilt = [_NOT_FINITE.fullmatch(field) is not None for field in fields]
-    if name == "cameras" and len(fields) > 4:
-        fields[1] = fields[1].upper()
-        fields[4:] = ["0"] * len(fields[4:]) if any(spoilt[4:]) else fields[4:]
-    elif name == "images" and any(spoilt):
-        pose = len(fields) > 9 and re.search("[A-Za-z]", fields[9])  # the pose line, before the line of features
-        fields = (
-            [fields[0], "1", "0", "0", "0", *(["1e300"] * 3), *fields[8:]] if pose else _replaced(fields, spoilt, "0")
-        )
-    elif name == "points3D" and any(spoilt):
-        fields = [*_replaced(fields[:7], spoilt, "1e300"), *_replaced(fields[7:], spoilt[7:], "-1")]
-    return " ".join(fields)
-
-
-def _replaced(fields: list[str], spoilt: list[bool], by: str) -> list[str]:
-    return [by if bad else field for field, bad in zip(fields, spoilt, strict=False)]
-
-
-def _checked(name: str, path: Path) -> bytes | bytearray:
-    """Checks the record counts of a binary file, since pycolmap allocates memory for any count.
-
-    Returns:
-        The content; all parameters of a camera are set to 0 if one is not finite.
+def _check_records(name: str, path: Path) -> None:
+    """Checks that the records of a binary file fill it: pycolmap would read on and allocate memory without bound.
 
     Raises:
-        FormatError: if the file ends early, or continues after its last record.
+        FormatError: if they do not.
     """
-    data = regular(path).read_bytes()
-    if name == "cameras":
-        data = bytearray(data)
-    place = 8
-    for number in range(_count(data, 0, path, "records")):
-        if name == "cameras":
-            size = 24 + 8 * _parameters(data, place + 4, path)
-            params = np.frombuffer(data[place + 24 : place + size], np.uint8)
-            if len(params) == size - 24 and not np.isfinite(params.view("<f8")).all():
-                data[place + 24 : place + size] = bytes(size - 24)  # pyright: ignore[reportIndexIssue]
-        elif name == "images":
-            end = data.find(b"\0", place + 64, place + 64 + 4096)
-            size = len(data) if end < 0 else end + 9 - place + 24 * _count(data, end + 1, path, "features")
-        else:
-            size = 51 + 8 * _count(data, place + 43, path, "observations")
-        place += size
-        if place > len(data):
-            raise FormatError(
-                f"{path}: record {number + 1} ends after the file's {len(data)} bytes; the file is truncated or damaged"
-            )
-    if place != len(data):
-        raise FormatError(f"{path}: {len(data) - place} bytes follow the last record; the file is damaged")
-    return data
-
-
-def _count(data: bytes | bytearray, place: int, path: Path, what: str) -> int:
-    if place + 8 > len(data):
-        raise FormatError(f"{path}: ends before a number of {what} at byte {place}; the file is truncated or damaged")
-    (count,) = struct.unpack_from("<Q", data, place)
-    if count > len(data):
-        raise FormatError(f"{path}, byte {place}: {count} {what} cannot be in {len(data)} bytes; the file is damaged")
-    return count
-
-
-def _parameters(data: bytes | bytearray, place: int, path: Path) -> int:
-    """Number of parameters of a camera's model."""
     import pycolmap  # pyright: ignore[reportMissingImports]
 
+    data = path.read_bytes()
+
+    def count(place: int, kind: str = "<Q") -> int:
+        return struct.unpack_from(kind, data, place)[0]
+
+    place = 8
     try:
-        (number,) = struct.unpack_from("<i", data, place)
-        return len(pycolmap.Camera.create_from_model_id(0, pycolmap.CameraModelId(number), 1.0, 1, 1).params)
-    except (struct.error, ValueError, IndexError, RuntimeError) as error:
-        raise FormatError(f"{path}, byte {place}: unknown camera model; the file is damaged") from error
-
-
-def _reason(error: BaseException) -> str:
-    text = " ".join(str(error).split()) or type(error).__name__
-    return re.sub(r"^\[[\w.]+:\d+\] ", "", text)[:200]
+        for _ in range(count(0)):
+            if name == "cameras":
+                model = pycolmap.CameraModelId(count(place + 4, "<i"))
+                place += 24 + 8 * len(pycolmap.Camera.create_from_model_id(0, model, 1.0, 1, 1).params)
+            elif name == "images":
+                end = data.index(b"\0", place + 64) + 1  # of the name
+                place = end + 8 + 24 * count(end)
+            else:
+                place += 51 + 8 * count(place + 43)
+    except (struct.error, ValueError, ArithmeticError, LookupError, RuntimeError):
+        place = -1
+    if place != len(data):
+        raise FormatError(f"{path}: its records do not fill its {len(data)} bytes; the file is truncated or damaged")

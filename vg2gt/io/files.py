@@ -13,7 +13,9 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
+
+from vg2gt.io.errors import FormatError
 
 log = logging.getLogger(__name__)
 
@@ -38,10 +40,10 @@ def replacing(path: str | Path, durable: bool = False) -> Iterator[Path]:
         yield temporary
         if durable:
             with open(temporary, "rb+") as file:
-                flush_to_disk(file)
+                os.fsync(file.fileno())
         os.replace(temporary, path)
         if durable:
-            flush_folder(path.parent)
+            _flush_folder(path.parent)
     except OSError as error:
         raise OSError(error.errno, f"{path} could not be written: {error.strerror or error}") from error
     finally:
@@ -61,22 +63,14 @@ def write_bytes(path: str | Path, content: bytes, durable: bool = False) -> Path
     return Path(path)
 
 
-def flush_to_disk(file: IO[bytes]) -> None:
-    """Flushes an open file to disk, so that its content survives a power failure."""
-    file.flush()
-    os.fsync(file.fileno())
-
-
-def flush_folder(folder: Path) -> None:
+def _flush_folder(folder: Path) -> None:
     """Flushes the names in a folder to disk, after a rename, if the file system can."""
-    if not hasattr(os, "O_DIRECTORY"):
-        return
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        with suppress(OSError):
+    with suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
             os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 def write_cached(path: str | Path, content: bytes, cache: str | Path) -> None:
@@ -113,7 +107,6 @@ def write_json(path: str | Path, content: Any) -> Path:
 def whole_folder(target: Path) -> Iterator[Path]:
     """Yields a folder to write into, which replaces ``target`` at the end of the block; on an error it is removed."""
     staged = temporary_name(target)
-    shutil.rmtree(staged, ignore_errors=True)
     staged.mkdir(parents=True)
     try:
         yield staged
@@ -138,16 +131,16 @@ def regular(path: str | Path) -> Path:
     return path
 
 
-def read_json(path: str | Path) -> Any:
-    """Reads a JSON file.
+def read_json(path: str | Path, content: bytes | None = None) -> Any:
+    """Reads a JSON file, or parses its ``content`` if it was read already.
 
     Raises:
-        ValueError: if it is not valid JSON, naming the file.
+        FormatError: if it is not valid JSON, naming the file.
     """
     try:
-        return json.loads(regular(path).read_text())
-    except json.JSONDecodeError as error:
-        raise ValueError(f"{path} is not valid JSON: {error}") from error
+        return json.loads(regular(path).read_bytes() if content is None else content)
+    except (ValueError, RecursionError) as error:
+        raise FormatError(f"{path}: not valid JSON ({error}); the file is truncated or damaged") from error
 
 
 def by_number(name: str) -> tuple[list[str | int], str]:

@@ -37,10 +37,7 @@ def to_arrays(gaussians: Gaussians) -> GaussianArrays:
         ValueError: if there is more than one scene, or a value cannot be written.
     """
     if len(gaussians) and int(gaussians.batch[0]) != int(gaussians.batch[-1]):
-        raise ValueError(
-            f"a file holds one scene, these Gaussians are of scenes {int(gaussians.batch[0])} to "
-            f"{int(gaussians.batch[-1])}; write Gaussians.scene(i) one by one"
-        )
+        raise ValueError("a file holds one scene, these Gaussians are of several; write Gaussians.scene(i) one by one")
     names = ("means", "quats", "scales", "opacities", "sh")
     arrays = {name: getattr(gaussians, name).detach().cpu().double().numpy() for name in names}
     for name, values in arrays.items():

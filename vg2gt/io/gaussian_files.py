@@ -27,8 +27,6 @@ def read_gaussians(path: str | Path) -> Gaussians:
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         raise ValueError(f"{path}: expected a scene of Gaussians, {' or '.join(READERS)}")
-    if not path.is_file():
-        raise FileNotFoundError(f"no scene at {path}")
     return reader(path)
 
 

@@ -29,16 +29,8 @@ Size = tuple[int, int]
 """Height and width in pixels."""
 
 _ORIENTATION_TAG = 0x0112
-# Transpositions that turn an image upright, by EXIF orientation.
-_TURNS = {
-    2: Image.Transpose.FLIP_LEFT_RIGHT,
-    3: Image.Transpose.ROTATE_180,
-    4: Image.Transpose.FLIP_TOP_BOTTOM,
-    5: Image.Transpose.TRANSPOSE,
-    6: Image.Transpose.ROTATE_270,
-    7: Image.Transpose.TRANSVERSE,
-    8: Image.Transpose.ROTATE_90,
-}
+_UPRIGHT = ("FLIP_LEFT_RIGHT", "ROTATE_180", "FLIP_TOP_BOTTOM", "TRANSPOSE", "ROTATE_270", "TRANSVERSE", "ROTATE_90")
+_TURNS = {number: Image.Transpose[name] for number, name in enumerate(_UPRIGHT, 2)}  # by EXIF orientation
 _QUARTER_TURNS = (5, 6, 7, 8)
 _SAME_SHAPE = 0.02  # relative difference of aspect ratios of the same shape
 _FILM_DIAGONAL = math.hypot(36, 24)  # millimetres
@@ -104,9 +96,7 @@ def read_color(
     """
     with _opened(path, scene, content) as image:
         check_size(path, scene, _size(image, upright), size)  # before anything is decoded
-        turn = _TURNS.get(_orientation(image)) if upright else None
-        picture = color_image(image)
-        return np.array(picture if turn is None else picture.transpose(turn))
+        return np.array(_turned(color_image(image), _orientation(image) if upright else 1))
 
 
 def read_mask(
@@ -128,10 +118,11 @@ def read_mask(
         grey = not has_alpha(image)
         if grey and not is_mask:
             return None
-        turn = _TURNS.get(_orientation(image)) if upright else None
-        plane = image if image.mode in ("I", "I;16") else image.convert("L") if grey else image
-        plane = plane if grey else image.convert("RGBA").getchannel("A")
-        values = np.array(plane if turn is None else plane.transpose(turn), np.float32)
+        if grey:
+            plane = image if image.mode in ("I", "I;16") else image.convert("L")
+        else:
+            plane = image.convert("RGBA").getchannel("A")
+        values = np.array(_turned(plane, _orientation(image) if upright else 1), np.float32)
     highest = values.max(initial=0)
     largest = 1 if grey and highest == 1 else 255 if highest <= 255 else 65535
     return None if values.min(initial=largest) >= largest else (values / largest).astype(np.float32)
@@ -155,7 +146,7 @@ def read_mask_file(path: Path, scene: str, photo: Path | None = None) -> NDArray
     upright = abs(mask.shape[0] * height / (mask.shape[1] * width) - 1) < _SAME_SHAPE
     if turn not in _QUARTER_TURNS or upright or not stored:
         return mask
-    return np.array(Image.fromarray(mask).transpose(_TURNS[turn]))
+    return np.array(_turned(Image.fromarray(mask), turn))
 
 
 def orientation(path: Path, scene: str) -> int:
@@ -172,10 +163,8 @@ def read_depth(path: Path, scene: str, size: Size | None = None) -> NDArray[np.i
             check_size(path, scene, image.size[::-1], size)
         pixels = np.array(image)
     if pixels.ndim != 2 or pixels.dtype.kind not in "iu":
-        raise DataError(
-            f"{path} of scene {scene} is not a depth image: expected one channel of 16-bit integers, found "
-            f"{pixels.dtype} values of shape {pixels.shape}"
-        )
+        found = f"{pixels.dtype} values of shape {pixels.shape}"
+        raise DataError(f"{path} of scene {scene} is not a depth image of one channel of integers, but {found}")
     return pixels.astype(np.int64)
 
 
@@ -199,6 +188,11 @@ def _opened(path: Path, scene: str, content: bytes | None = None) -> Iterator[Im
     except _DAMAGED as error:
         whose, remedy = (f" of scene {scene}", "remove the frame") if scene else ("", "leave it out")
         raise DataError(f"cannot read {path}{whose}: {error}; restore the file or {remedy}") from error
+
+
+def _turned(picture: Image.Image, orientation: int) -> Image.Image:
+    """Turns an image of an EXIF orientation upright."""
+    return picture.transpose(_TURNS[orientation]) if orientation in _TURNS else picture
 
 
 def _size(image: Image.Image, upright: bool) -> Size:

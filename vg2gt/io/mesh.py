@@ -17,10 +17,10 @@ from torch import Tensor
 from vg2gt.geometry.cameras import ray_directions, unproject
 from vg2gt.geometry.normals import normals_from_depth
 from vg2gt.io.files import write_bytes
-from vg2gt.io.points import TO_GLTF
 from vg2gt.types import Cameras
 
-SUFFIXES = (".ply", ".glb", ".obj")
+SUFFIXES = (".ply", ".glb")
+MAX_VOXELS = 64_000_000  # bounds the memory at about 3 GB
 _TRUNCATION = 4  # distance from a surface at which free space begins, in voxels
 _BLOCK = 8  # voxels along a block's edge
 _KEY_BITS = 20  # voxel indices lie in [-2^20, 2^20)
@@ -44,9 +44,7 @@ class Mesh:
     colors: NDArray[np.uint8]
 
 
-def fuse_depth(
-    depth: Tensor, cameras: Cameras, colors: Tensor, *, voxel_size: float, max_voxels: int = 64_000_000
-) -> Mesh:
+def fuse_depth(depth: Tensor, cameras: Cameras, colors: Tensor, *, voxel_size: float) -> Mesh:
     """Fuses depth maps of one scene into a mesh.
 
     Averages a truncated signed distance along the optical axis over the views, at voxels near surfaces. The mesh is its
@@ -58,18 +56,17 @@ def fuse_depth(
         cameras: cameras of the V views of one scene (B = 1), of the depth maps' size.
         colors: ``[V, 3, H, W]`` in [0, 1].
         voxel_size: edge length of a voxel in scene units; smaller details are lost.
-        max_voxels: maximum number of voxels, which bounds the memory at about 50 bytes each (3 GB).
 
     Returns:
         The mesh; empty if there is no valid depth.
 
     Raises:
-        ValueError: if shapes disagree, a value is not finite, or ``max_voxels`` is exceeded.
+        ValueError: if shapes disagree, a value is not finite, or :data:`MAX_VOXELS` is exceeded.
     """
     _check(depth, cameras, colors, voxel_size)
     cameras = cameras.map(lambda tensor: tensor.detach().cpu().float())
     depth, colors = depth.detach().cpu().float(), colors.detach().cpu().float()
-    blocks = _surface_blocks(depth, cameras, voxel_size, max_voxels)
+    blocks = _surface_blocks(depth, cameras, voxel_size)
     inside = torch.stack(torch.meshgrid(*3 * [torch.arange(_BLOCK)], indexing="ij"), -1).reshape(-1, 3)
     # weighted sums at the voxels of each block: signed distance over the truncation, colour; and the weights
     sums, weight = torch.zeros(len(blocks), _BLOCK**3, 4), torch.zeros(len(blocks), _BLOCK**3)
@@ -92,7 +89,7 @@ def write_mesh(path: str | Path, mesh: Mesh) -> Path:
     """Writes a mesh with trimesh, atomically, in our world frame, ``.glb`` with y up; the suffix selects the format.
 
     Args:
-        path: a file ending in ``.ply``, ``.glb`` or ``.obj``.
+        path: a file ending in ``.ply`` or ``.glb``.
         mesh: mesh to write; not changed.
 
     Raises:
@@ -107,21 +104,19 @@ def write_mesh(path: str | Path, mesh: Mesh) -> Path:
         raise ValueError("the mesh is empty: no valid depth, or voxels larger than the surfaces; check both")
     body = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.colors, process=False)
     if path.suffix.lower() == ".glb":
-        body.apply_transform(TO_GLTF)
+        body.apply_transform(np.diag([1.0, -1.0, -1.0, 1.0]))  # glTF has y up, our world has y down
     content = body.export(file_type=path.suffix[1:].lower())
-    assert not isinstance(content, dict)  # only formats with several files give a dict
-    return write_bytes(path, content.encode() if isinstance(content, str) else content)
+    assert isinstance(content, bytes)
+    return write_bytes(path, content)
 
 
 def _check(depth: Tensor, cameras: Cameras, colors: Tensor, voxel_size: float) -> None:
     views, (height, width) = cameras.world_to_camera.shape[1], cameras.size
-    if len(cameras.world_to_camera) != 1 or depth.shape != (views, height, width) or min(height, width) < 2:
+    wanted, found = [(views, height, width), (views, 3, height, width)], [depth.shape, colors.shape]
+    if len(cameras.world_to_camera) != 1 or found != wanted or min(height, width) < 2:
         raise ValueError(
-            f"depth must be {[views, height, width]}, at least 2x2, with one camera per map of one scene, got depth "
-            f"{list(depth.shape)} and cameras of {len(cameras.world_to_camera)} scenes; use Cameras.scene"
+            f"depth and colors must be {wanted}, at least 2x2, of one scene, got {list(map(tuple, found))}"
         )
-    if colors.shape != (views, 3, height, width):
-        raise ValueError(f"colors must be {[views, 3, height, width]} like depth, got {list(colors.shape)}")
     tensors = {"depth": depth, "world_to_camera": cameras.world_to_camera, "intrinsics": cameras.intrinsics}
     for name, tensor in tensors.items():
         if not torch.isfinite(tensor).all():
@@ -130,7 +125,7 @@ def _check(depth: Tensor, cameras: Cameras, colors: Tensor, voxel_size: float) -
         raise ValueError(f"voxel_size must be positive, got {voxel_size}")
 
 
-def _surface_blocks(depth: Tensor, cameras: Cameras, voxel_size: float, max_voxels: int) -> Tensor:
+def _surface_blocks(depth: Tensor, cameras: Cameras, voxel_size: float) -> Tensor:
     """Blocks ``[N, 3]`` with a point within the truncation before or behind a depth sample, sorted, unique.
 
     A block starts at voxel ``_BLOCK * index``; the centre of voxel i is at ``(i + 1/2) * voxel_size``.
@@ -149,18 +144,14 @@ def _surface_blocks(depth: Tensor, cameras: Cameras, voxel_size: float, max_voxe
             points = unproject(shifted[None, None], cameras.select(slice(view, view + 1)))[0, 0][shifted > 0]
             index = torch.floor(points / voxel_size)
             if len(index) and index.abs().max() >= limit:
-                raise ValueError(
-                    f"the scene reaches {points.abs().max():.4g} units from the origin, more than {limit} voxels of "
-                    f"{voxel_size:g}; set far depth to 0 or take larger voxels"
-                )
+                reach = f"the scene reaches more than {limit} voxels of {voxel_size:g} from the origin"
+                raise ValueError(f"{reach}; set far depth to 0 or take larger voxels")
             voxels = _unpack(torch.unique(_pack(index.long())))
             touched = torch.div(voxels[:, None] + around, _BLOCK, rounding_mode="floor")
             blocks = torch.unique(torch.cat((blocks, _pack(touched.reshape(-1, 3)))))
-        if len(blocks) * _BLOCK**3 > max_voxels:
-            raise ValueError(
-                f"the surfaces need more than max_voxels={max_voxels} voxels of {voxel_size:g}; take larger voxels, "
-                "set far depth to 0, or raise max_voxels"
-            )
+        if len(blocks) * _BLOCK**3 > MAX_VOXELS:
+            need = f"the surfaces need more than {MAX_VOXELS} voxels of {voxel_size:g}"
+            raise ValueError(f"{need}; take larger voxels, or set far depth to 0")
     return _unpack(blocks)
 
 

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vg2gt.io.files import write_json
-from vg2gt.io.json_checks import Fields, check_rigid, load_json
+from vg2gt.io.cameras_json import Fields, check_rigid
+from vg2gt.io.files import read_json, write_json
 
 PIXEL_CENTER = 0.5  # centre of the first pixel in the file; ours is at 0
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
@@ -142,11 +142,9 @@ def read_transforms(path: str | Path) -> Transforms:
         FormatError: if the file is not JSON or a field is wrong, naming the file and the field.
     """
     path = Path(path)
-    top = Fields(f"{path}: ", load_json(path))
+    top = Fields(f"{path}: ", read_json(path))
     shared = _read_lens(top, Lens())
-    frames = top.get("frames", list, "a list of frames")
-    if frames is None:
-        raise top.wrong("frames", "a list of frames")
+    frames = top.get("frames", list, "a list of frames", required=True)
     read = [_read_frame(Fields(f"{path}: frames[{i}].", frame), shared) for i, frame in enumerate(frames)]
     return Transforms(tuple(read), top.get("ply_file_path", str, "a file name"))
 
@@ -157,14 +155,10 @@ def write_transforms(path: str | Path, transforms: Transforms) -> Path:
     Raises:
         ValueError: if a pose is not finite.
     """
-    frames, content = transforms.frames, {}
-    shared = bool(frames) and all(frame.lens == frames[0].lens for frame in frames)
-    if shared:
-        content.update(_lens_fields(frames[0].lens))
-    if transforms.ply_file_path is not None:
-        content["ply_file_path"] = transforms.ply_file_path
-    content["frames"] = [_frame_fields(frame, with_lens=not shared) for frame in frames]
-    return write_json(path, content)
+    frames = transforms.frames
+    shared = _lens_fields(frames[0].lens) if all(frame.lens == frames[0].lens for frame in frames) and frames else {}
+    cloud = {} if transforms.ply_file_path is None else {"ply_file_path": transforms.ply_file_path}
+    return write_json(path, {**shared, **cloud, "frames": [_frame_fields(frame, not shared) for frame in frames]})
 
 
 def _read_lens(fields: Fields, shared: Lens) -> Lens:
@@ -206,13 +200,9 @@ def _frame_fields(frame: TransformsFrame, with_lens: bool) -> dict[str, Any]:
     pose = np.asarray(frame.world_to_camera, np.float64)
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise ValueError(f"{frame.file_path}: world_to_camera must be finite [4, 4], got {pose.tolist()}")
-    content: dict[str, Any] = {
-        "file_path": frame.file_path,
-        "transform_matrix": (np.linalg.inv(pose) @ _OPENGL).tolist(),
-    }
-    for name in ("depth_file_path", "mask_path"):
-        if getattr(frame, name) is not None:
-            content[name] = getattr(frame, name)
+    paths = {name: getattr(frame, name) for name in ("file_path", "depth_file_path", "mask_path")}
+    content = {name: path for name, path in paths.items() if path is not None}
+    content["transform_matrix"] = (np.linalg.inv(pose) @ _OPENGL).tolist()
     return {**content, **_lens_fields(frame.lens)} if with_lens else content
 
 

@@ -38,7 +38,6 @@ _TYPES = {
     **dict.fromkeys(("double", "float64"), "f8"),
 }
 _ENCODINGS = {"binary_little_endian": "<", "binary_big_endian": ">"}
-_LIST = "list"
 _HEADER_LIMIT = 1 << 16
 _END = b"end_header"
 
@@ -101,9 +100,7 @@ def read_gaussian_ply(path: str | Path) -> Gaussians:
     found = table.dtype.names or ()
     rest = tuple(f"f_rest_{i}" for i in range(sum(name.startswith("f_rest_") for name in found)))
     if len(rest) not in (0, 9, 24, 45):
-        raise FormatError(
-            f"{path}: {len(rest)} f_rest properties, expected 0, 9, 24 or 45 (degree 0 to 3); write the file again"
-        )
+        raise FormatError(f"{path}: {len(rest)} f_rest properties, expected 0, 9, 24 or 45 (degree 0 to 3)")
     higher = _columns(path, table, rest).reshape(len(table), 3, len(rest) // 3).transpose(0, 2, 1)
     sh = np.concatenate((_columns(path, table, _DC)[:, None], higher), 1)
     with np.errstate(over="ignore"):  # infinite results are counted and dropped later
@@ -144,10 +141,8 @@ def _columns(path: Path, table: NDArray, names: tuple[str, ...]) -> NDArray[np.f
     """Stacks properties to ``[N, len(names)]``, float64."""
     missing = [name for name in names if name not in (table.dtype.names or ())]
     if missing:
-        raise FormatError(
-            f"{path}: vertices have no {', '.join(missing)}, only {', '.join(table.dtype.names or ())}; expected "
-            "x y z f_dc_* opacity scale_* rot_* (a compressed PLY is converted by PlayCanvas's splat-transform)"
-        )
+        what = f"vertices have no {', '.join(missing)}, only {', '.join(table.dtype.names or ())}"
+        raise FormatError(f"{path}: {what} (a compressed PLY is converted by PlayCanvas's splat-transform)")
     values = np.empty((len(table), len(names)))
     with np.errstate(invalid="ignore"):  # signalling NaNs of damaged files become quiet NaNs
         for i, name in enumerate(names):
@@ -156,53 +151,40 @@ def _columns(path: Path, table: NDArray, names: tuple[str, ...]) -> NDArray[np.f
 
 
 def _read_vertices(path: Path) -> tuple[NDArray, list[str]]:
-    """Reads the ``vertex`` element as a structured array, and the header's comments; later elements are ignored."""
+    """Reads the ``vertex`` element as a structured array, and the header's comments."""
     data = regular(path).read_bytes()
     end = data.find(_END, 0, _HEADER_LIMIT)
-    start = data.find(b"\n", end, end + len(_END) + 3) + 1
-    if not data.startswith(b"ply") or end < 0 or start == 0:
+    offset = data.find(b"\n", end, end + len(_END) + 3) + 1
+    if not data.startswith(b"ply") or end < 0 or offset == 0:
         raise FormatError(f"{path}: not a PLY file, expected a header from 'ply' to 'end_header'")
     lines = data[:end].decode("latin-1").splitlines()
     comments = [line.removeprefix("comment").strip() for line in lines if line.startswith("comment ")]
-    dtype, count, skipped = _layout(path, [line.split() for line in lines])
-    offset = start + skipped
-    needed, left = count * dtype.itemsize, max(0, len(data) - offset)
+    dtype, count = _layout(path, [line.split() for line in lines])
+    needed, left = count * dtype.itemsize, len(data) - offset
     if needed > left:
-        raise FormatError(
-            f"{path}, byte {offset}: {count} vertices of {dtype.itemsize} bytes need {needed} bytes, {left} are left; "
-            "the file is truncated or damaged"
-        )
+        raise FormatError(f"{path}: {count} vertices need {needed} bytes, {left} are left; it is truncated or damaged")
     return np.frombuffer(data, dtype, count, offset), comments
 
 
-def _layout(path: Path, lines: list[list[str]]) -> tuple[np.dtype, int, int]:
-    """Type of a vertex, number of vertices, and number of bytes of the elements before them."""
-    order = ""
-    elements: list[tuple[str, int, dict[str, str]]] = []  # name, count, type of each property
+def _layout(path: Path, lines: list[list[str]]) -> tuple[np.dtype, int]:
+    """Type of a vertex and number of vertices, which must come first; later elements are ignored."""
+    order, count = "", -1
+    types: dict[str, str] = {}
     for number, words in enumerate(lines, 1):
         match words:
             case [] | ["ply" | "comment" | "obj_info", *_]:
                 continue
             case ["format", encoding, _] if encoding in _ENCODINGS:
                 order = _ENCODINGS[encoding]
-            case ["element", name, count] if count.isascii() and count.isdigit() and len(count) <= 18:
-                elements.append((name, int(count), {}))
-            case ["property", kind, name] if elements and kind in _TYPES and name not in elements[-1][2]:
-                elements[-1][2][name] = order + _TYPES[kind]
-            case ["property", "list", _, _, name] if elements:
-                elements[-1][2][name] = _LIST
+            case ["element", "vertex", text] if order and text.isascii() and text.isdigit() and len(text) <= 18:
+                count = int(text)
+            case ["element", *_] if types:
+                break
+            case ["property", kind, name] if count >= 0 and kind in _TYPES and name not in types:
+                types[name] = order + _TYPES[kind]
             case _:
-                raise FormatError(
-                    f"{path}, line {number} of the header: unexpected {' '.join(words)[:60]!r}; the file is damaged or "
-                    f"not binary (expected the format {' or '.join(_ENCODINGS)})"
-                )
-    names = [name for name, *_ in elements]
-    if not order or "vertex" not in names:
-        raise FormatError(
-            f"{path}: {'no element vertex' if order else 'no format'} in the header, only elements "
-            f"{', '.join(names) or 'none'}; this is not a file of points"
-        )
-    *before, (_, count, fields) = elements[: names.index("vertex") + 1]
-    if not fields or any(_LIST in types.values() for types in (fields, *(types for *_, types in before))):
-        raise FormatError(f"{path}: vertices without properties, or a list in or before them; write them first")
-    return np.dtype(list(fields.items())), count, sum(n * np.dtype(list(t.items())).itemsize for _, n, t in before)
+                what = f"line {number} of the header: unexpected {' '.join(words)[:60]!r}"
+                raise FormatError(f"{path}, {what}; it is damaged, or does not begin with binary vertices")
+    if not types:
+        raise FormatError(f"{path}: no vertices in the header; this is not a file of points")
+    return np.dtype(list(types.items())), count

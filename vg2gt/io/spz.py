@@ -1,9 +1,9 @@
 """``.spz``, Niantic's compressed Gaussians: a gzip stream of columns, about a tenth of the size of a PLY.
 
 A header of 16 bytes (magic, version, number of Gaussians, degree, fractional bits, flags), then all positions (24-bit
-fixed point), opacities, colours, log-scales (a byte each), rotations (version 3: the smallest three of x y z w in 32
-bits; version 2: x y z in a byte each) and higher spherical harmonics (a byte each). Axes are those of the PLY, as
-Niantic's converter and SuperSplat write them; the format defines none. Format: https://github.com/nianticlabs/spz
+fixed point), opacities, colours, log-scales (a byte each), rotations (the smallest three of x y z w in 32 bits) and
+higher spherical harmonics (a byte each). Axes are those of the PLY, as Niantic's converter and SuperSplat write them;
+the format defines none. Format: https://github.com/nianticlabs/spz
 
 Losses compared with a PLY file: positions are rounded to 2^-21 of the scene's extent or 2^-20 units, scales to 3.2 %
 and clipped to [4.5e-5, 380], opacities to 1/510, colours to 1/270 and clipped to [-0.44, 1.44], rotations to 1/700,
@@ -60,7 +60,7 @@ def write_spz(path: str | Path, gaussians: Gaussians) -> Path:
 
 
 def read_spz(path: str | Path) -> Gaussians:
-    """Reads a ``.spz`` file of version 2 or 3.
+    """Reads a ``.spz`` file of version 3.
 
     Returns:
         The Gaussians as scene 0, float32.
@@ -70,26 +70,18 @@ def read_spz(path: str | Path) -> Gaussians:
     """
     path = Path(path)
     content = regular(path).read_bytes()
-    if content.startswith(_MAGIC):
-        raise FormatError(
-            f"{path}: .spz version 4 is not supported, only 2 and 3; convert it with splat-transform --spz-version 3"
-        )
+    expected = f"{path}: expected a .spz of version 3 (splat-transform --spz-version 3 converts others)"
     try:
         with gzip.open(io.BytesIO(content)) as file:
             magic, version, count, degree, bits, _, _ = _HEADER.unpack(file.read(_HEADER.size))
-            if magic != _MAGIC or version not in (2, 3) or degree > 3 or bits > 23:
-                raise FormatError(
-                    f"{path}: magic {magic!r}, version {version}, degree {degree}, {bits} fractional bits; expected a "
-                    ".spz of version 2 or 3 and degree 0 to 3"
-                )
-            sides = (9, 1, 3, 3, 4 if version == 3 else 3, 3 * ((degree + 1) ** 2 - 1))
+            if magic != _MAGIC or version != 3 or degree > 3 or bits > 23:
+                raise FormatError(f"{expected}, got {magic!r} {version}, degree {degree}, {bits} fractional bits")
+            sides = (9, 1, 3, 3, 4, 3 * ((degree + 1) ** 2 - 1))
             data = file.read(count * sum(sides) + 1)
     except (OSError, EOFError, zlib.error, struct.error) as error:
-        raise FormatError(f"{path}: not a .spz file, or damaged: {error}") from error
+        raise FormatError(f"{expected}; not one, or damaged: {error}") from error
     if len(data) != count * sum(sides):
-        raise FormatError(
-            f"{path}: {count} Gaussians need {count * sum(sides)} bytes, found {len(data)}; it is damaged"
-        )
+        raise FormatError(f"{path}: {count} Gaussians need {count * sum(sides)} bytes, found {len(data)}")
     ends = np.cumsum([count * side for side in sides])[:-1]
     position, alpha, color, scale, rotation, rest = (
         part.reshape(count, side) for part, side in zip(np.split(np.frombuffer(data, "u1"), ends), sides, strict=True)
@@ -124,10 +116,7 @@ def _packed(quats: NDArray[np.floating]) -> NDArray[np.uint32]:
 
 
 def _unpacked(packed: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Decodes the bytes of version 2 or 3 to unit quaternions ``[N, 4]`` xyzw."""
-    if packed.shape[1] == 3:
-        axis = packed / 127.5 - 1
-        return np.concatenate((axis, np.sqrt(np.maximum(1 - (axis**2).sum(1, keepdims=True), 0))), 1)
+    """Decodes the result of :func:`_packed` to unit quaternions ``[N, 4]`` xyzw."""
     word = np.ascontiguousarray(packed).view("<u4")
     parts = word >> np.array([20, 10, 0], "<u4") & 1023
     others = np.where(parts >> 9, -1, 1) * (parts & 511) / (511 * np.sqrt(2))

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor
 
@@ -39,9 +38,7 @@ def read_tensors(path: str | Path) -> dict[str, Tensor]:
         state = torch.load(regular(path), map_location="cpu", weights_only=True)
     except FileNotFoundError:
         raise
-    except SafetensorError as error:
-        raise FormatError(f"{path} is damaged or not a safetensors file: {error}") from error
-    except Exception as error:  # damage raises various errors of unpickler, zip reader, allocator
+    except Exception as error:  # damage raises various errors of safetensors, unpickler, zip reader, allocator
         reason = str(error).strip().splitlines() or [type(error).__name__]
         raise FormatError(f"{path} is damaged or holds more than tensors and plain values: {reason[0]}") from error
     if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):

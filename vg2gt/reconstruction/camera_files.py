@@ -16,8 +16,7 @@ from vg2gt.io import colmap_images, colmap_intrinsics, colmap_pose, read_cameras
 from vg2gt.io.cameras_json import NamedCamera, invert_pose
 from vg2gt.io.colmap import colmap_files
 from vg2gt.io.errors import FormatError
-from vg2gt.io.files import by_number
-from vg2gt.io.json_checks import load_json
+from vg2gt.io.files import by_number, read_json
 
 
 def read_cameras(path: str | Path) -> list[NamedCamera]:
@@ -37,7 +36,7 @@ def read_cameras(path: str | Path) -> list[NamedCamera]:
         return _of_colmap(path)
     if not path.is_file():
         raise FileNotFoundError(f"no cameras at {path}")
-    content = load_json(path)
+    content = read_json(path)
     if isinstance(content, dict) and "frames" in content:
         return _of_transforms(path)
     if isinstance(content, list) and content and isinstance(content[0], dict) and "img_name" in content[0]:
@@ -50,9 +49,8 @@ def _of_colmap(folder: Path) -> list[NamedCamera]:
     model = read_colmap(next((place for place in places if colmap_files(place)), folder))
     cameras = []
     for image in colmap_images(model):
-        lens, pose = pinhole_camera(image.camera), colmap_pose(image)
-        if np.isfinite(pose).all():
-            cameras.append(NamedCamera(image.name, lens.width, lens.height, colmap_intrinsics(lens), pose))
+        lens = pinhole_camera(image.camera)
+        cameras.append(NamedCamera(image.name, lens.width, lens.height, colmap_intrinsics(lens), colmap_pose(image)))
     return cameras
 
 

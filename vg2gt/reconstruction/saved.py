@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from vg2gt.io import read_cameras_json, read_gaussian_ply
-from vg2gt.io.arrays import npz_names, read_npz
+from vg2gt.io.arrays import read_npz
 from vg2gt.io.cameras_json import NamedCamera
 from vg2gt.io.errors import FormatError
 from vg2gt.io.files import read_json
@@ -72,7 +72,7 @@ def read_scene(folder: str | Path, renderer: Renderer, device: torch.device | st
 def _read_views(path: Path, named: list[NamedCamera], size: tuple[int, int]) -> dict[str, Any]:
     """Returns images, depth, confidence and, if saved, mask, error and support of the views."""
     try:
-        arrays = read_npz(path, [*NEEDED, *(name for name in KNOWN if name in npz_names(path))])
+        arrays = read_npz(path, NEEDED, KNOWN)
         names = arrays.pop("names", None)
         if names is not None and names.tolist() != [view_stem(camera.name) for camera in named]:
             raise FormatError("it is of other images than cameras.json next to it")

@@ -31,8 +31,7 @@ from vg2gt.data.sources.colmap_model import COLMAP, model_folder_of
 from vg2gt.data.transforms import reduce_to_fit, to_bytes
 from vg2gt.io.colmap import EXTRA, quiet_colmap
 from vg2gt.io.errors import FormatError
-from vg2gt.io.files import whole_folder, write_json
-from vg2gt.io.json_checks import load_json
+from vg2gt.io.files import read_json, whole_folder, write_json
 from vg2gt.reconstruction.given_cameras import LAYOUTS, recording_pictures
 from vg2gt.reconstruction.monitor import Monitor
 from vg2gt.reconstruction.pictures import SFM_SOURCE, UNKNOWN_LENS, Picture, digest, mask_file, without_copies
@@ -140,7 +139,7 @@ def _key(pictures: Sequence[Picture]) -> str:
 def _read_state(folder: Path) -> dict[str, Any] | None:
     """Reads the state of a result folder; None if it is missing, incomplete or damaged."""
     try:
-        state = load_json(folder / _STATE)
+        state = read_json(folder / _STATE)
     except (FormatError, OSError):
         return None
     kinds = {"key": str, "images": dict, "left_out": list, "points": int}

@@ -29,6 +29,9 @@ OWN = ("vg2gt", "backends")
 KINDS = (nn.Module, SceneSource, SceneScale, ViewCheck, Renderer)
 """Classes of this project that a run's file may name, besides data modules; their constructors at most read files."""
 
+GONE = ("background", "compile", "drift", "provider")
+"""Options that our backends had in former versions; no network depends on them."""
+
 
 class UntrustedError(ValueError):
     """An untrusted file asks for more than data."""
@@ -58,7 +61,16 @@ def parse_run_config(text: str, source: str | Path) -> DictConfig:
         raise ValueError(f"{source} is not a run's configuration: {' '.join(str(error).split())}") from error
     if not isinstance(content, dict):
         raise ValueError(f"{source} is not a run's configuration: expected a mapping")
+    if "backend" in content:
+        content["backend"] = _without_gone(content["backend"])
     return OmegaConf.create(content)
+
+
+def _without_gone(part: Any) -> Any:
+    if not isinstance(part, dict):
+        return part
+    gone = GONE if str(part.get("_target_")).startswith("backends.") else ()
+    return {key: _without_gone(value) for key, value in part.items() if key not in gone}
 
 
 def check_targets(config: Any, source: str | Path) -> None:

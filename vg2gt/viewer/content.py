@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
-from vg2gt.io.arrays import npz_names, read_npz
+from vg2gt.io.arrays import read_npz
 from vg2gt.io.cameras_json import NamedCamera, invert_pose
 from vg2gt.io.images import color_image, open_image
 from vg2gt.io.points import scene_extent
@@ -116,8 +116,8 @@ def load_view_pictures(cameras: Sequence[NamedCamera], path: Path) -> list[NDArr
     if not path.is_file():
         return []
     try:
-        names = read_npz(path, ["names"])["names"].tolist() if "names" in npz_names(path) else None
-        if names is not None and names != [camera.name.removesuffix(".png") for camera in cameras]:
+        names = read_npz(path, [], ["names"]).get("names")
+        if names is not None and names.tolist() != [camera.name.removesuffix(".png") for camera in cameras]:
             return []
         pictures = [Image.fromarray(image) for image in read_npz(path, ["images"])["images"]]
     except Exception as error:  # damaged archives and arrays that are no images

@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 
 from vg2gt.data.sources.parsing import CORNER_TO_CENTER, errors_name, numbered, pinhole, pose_matrices
 from vg2gt.io.errors import FormatError
+from vg2gt.io.files import read_json
 from vg2gt.io.image_files import Size, image_size
-from vg2gt.io.json_checks import load_json
 from vg2gt.io.record3d import is_archive, read_recorded, recorded_files, unpack_lzfse
 from vg2gt.io.video import video_size
 
@@ -94,7 +94,7 @@ def _unpacked(path: Path, kind: np.dtype[Any], size: Size) -> NDArray[Any]:
 def _read_record3d(recording: Path, scene: str) -> Recording:
     """Reads a ``.r3d``: ``poses`` as qx qy qz qw x y z; column-major ``K``, or coefficients per frame."""
     path = recording / "metadata"
-    content = load_json(path, read_recorded(path))
+    content = read_json(path, read_recorded(path))
     color, depth = recorded_files(recording, ".jpg"), recorded_files(recording, PACKED)
     first = next(iter(color.values()), None)
     size = image_size(first, scene, content=read_recorded(first)) if first else (0, 0)
@@ -132,7 +132,7 @@ def _read_polycam(folder: Path, scene: str) -> Recording:
     color, depth = numbered(inside / f"{before}images", scene), numbered(inside / "depth", scene)
     poses, intrinsics = {}, {}
     for frame, path in numbered(inside / f"{before}cameras", scene, suffixes=(".json",)).items():
-        content = load_json(path)
+        content = read_json(path)
         rows = _numbers(path, content, *(f"t_{row}{column}" for row in range(3) for column in range(4)))
         poses[frame] = np.vstack((rows.reshape(3, 4), [0, 0, 0, 1])) @ _OPENGL
         intrinsics[frame] = pinhole(*_numbers(path, content, "fx", "fy", "cx", "cy")) - CORNER_TO_CENTER

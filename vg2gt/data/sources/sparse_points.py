@@ -45,7 +45,7 @@ class SparsePoints:
 
     def __init__(self, model: Reconstruction, sound: bool = True) -> None:
         model = _without_outliers(model) if sound else model
-        points = {number: point.xyz for number, point in model.points3D.items() if (np.abs(point.xyz) < _FAR).all()}
+        points = {number: point.xyz for number, point in model.points3D.items()}
         views = []
         for image in colmap_images(model):
             observed = [feature for feature in image.get_observation_points2D() if feature.point3D_id in points]
