@@ -42,12 +42,6 @@ def lower_median(x: np.ndarray) -> float:
     return float(np.sort(x)[(len(x) - 1) // 2])
 
 
-def by_weighted_median(p: np.ndarray, r: np.ndarray) -> np.ndarray:
-    scales = r / p
-    costs = [np.sum(np.abs(s * p - r) / r) for s in scales]
-    return p * scales[int(np.argmin(costs))]
-
-
 def test_matches_numpy_by_image_and_by_scene() -> None:
     predicted, reference = maps()
     predicted[1] *= 1.2
@@ -55,8 +49,6 @@ def test_matches_numpy_by_image_and_by_scene() -> None:
     shared = lower_median((reference[valid] / predicted[valid]).numpy())
     for alignment, scale in {
         "median": lambda p, r: p * lower_median(r / p),
-        "wmed": by_weighted_median,
-        "scale_shift": lambda p, r: np.polyval(np.polyfit(p, r, 1), p),
         "none": lambda p, r: p,
         "scene": lambda p, r: p * shared,
     }.items():

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import threading
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -66,24 +67,20 @@ class _View:
     size: tuple[int, int]
 
     @property
-    def across(self) -> int:
-        """Tiles per image row."""
+    def across(self) -> int:  # tiles per image row
         return -(-self.size[1] // tiles.TILE)
 
     @property
-    def tiles(self) -> int:
-        """Tiles per image."""
+    def tiles(self) -> int:  # per image
         return self.across * -(-self.size[0] // tiles.TILE)
 
     @property
-    def tile_ranges(self) -> list[tuple[int, int]]:
-        """First and last tile (exclusive) of every work item."""
+    def tile_ranges(self) -> list[tuple[int, int]]:  # first and last tile (exclusive) of every work item
         starts = range(0, self.tiles, TILES_PER_ITEM)
         return [(start, min(start + TILES_PER_ITEM, self.tiles)) for start in starts]
 
     @property
-    def blocks(self) -> range:
-        """Indices of the blocks of ``BLOCK`` Gaussians."""
+    def blocks(self) -> range:  # of Gaussians
         return range(-(-len(self.means) // BLOCK))
 
 
@@ -184,35 +181,20 @@ def _parameters(options: RenderOptions, dtype: np.dtype) -> np.ndarray:
     return np.array(values, dtype)
 
 
-@dataclass(frozen=True)
-class _Scratch:
-    """One thread's scratch memory (names as in the kernels)."""
-
-    state: np.ndarray
-    sums: np.ndarray
-    hits: np.ndarray
-    counts: np.ndarray
-    staged: np.ndarray
-    spans: np.ndarray
-    total: np.ndarray
-    work: np.ndarray
-    indices: np.ndarray
-
-
-def _scratch(dtype: np.dtype) -> _Scratch:
-    """Returns this thread's scratch memory, kept between calls."""
+def _scratch(dtype: np.dtype) -> SimpleNamespace:
+    """Returns this thread's scratch memory (names as in the kernels), kept between calls."""
     buffers = _local.__dict__.setdefault("buffers", {})
     if dtype not in buffers:
-        buffers[dtype] = _Scratch(
-            _aligned(tiles.PLANES * tiles.PLANE, dtype),
-            _aligned(tiles.SUMS_ROWS * tiles.LANES, dtype),
-            _aligned(tiles.BLOCKS * HIT_CAPACITY * tiles.HIT_SIZE, dtype),
-            np.zeros(tiles.BLOCKS, np.int64),
-            np.zeros((tiles.STAGED, tiles.RECORD + 3), dtype),
-            np.zeros((tiles.STAGED, 4), np.int64),
-            np.empty(16, np.float64),
-            np.ones(FIELDS * CHUNK, np.float64),
-            np.empty(CHUNK, np.int64),
+        buffers[dtype] = SimpleNamespace(
+            state=_aligned(tiles.PLANES * tiles.PLANE, dtype),
+            sums=_aligned(tiles.SUMS_ROWS * tiles.LANES, dtype),
+            hits=_aligned(tiles.BLOCKS * HIT_CAPACITY * tiles.HIT_SIZE, dtype),
+            counts=np.zeros(tiles.BLOCKS, np.int64),
+            staged=np.zeros((tiles.STAGED, tiles.RECORD + 3), dtype),
+            spans=np.zeros((tiles.STAGED, 4), np.int64),
+            total=np.empty(16, np.float64),
+            work=np.ones(FIELDS * CHUNK, np.float64),
+            indices=np.empty(CHUNK, np.int64),
         )
     return buffers[dtype]
 
