@@ -247,19 +247,14 @@ class Reconstructor(nn.Module, ABC):
 class VG2GT(Reconstructor):
     """Feed-forward Gaussian reconstruction on a frozen backbone (paper, eqn propose).
 
+    See :class:`Reconstructor` for the other arguments; the visibility of the enhanced geometry is checked.
+
     Args:
-        backend: the frozen visual foundation model.
-        scale: fixes the scene unit.
         coarse: factory of the coarse-level feature enhancement, called with ``token_dims`` and ``patch_size``; None
             (ablation w/o Coarse) uses the backbone's geometry.
         fine: factory of the fine-level voxel module, called with ``token_dims`` and ``patch_size``.
         gaussians: factory of the self-splitting Gaussian head, called with ``in_channels``.
         keep_scale: rescales the enhanced depth to the scale of the backbone's, see :func:`with_scale_of`.
-        background: see :class:`Reconstructor`.
-        visibility: see :class:`Reconstructor`; applied to the enhanced geometry before the fine level.
-
-    Raises:
-        ValueError: if the scale is metric but the backend is not, or the background is unknown.
     """
 
     def __init__(

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vg2gt.kernels.constants import CONVERGED, MEDIAN_MAX_TRANSMITTANCE, TRANSMITTANCE_STOP
+from vg2gt.kernels.constants import CONVERGED, MEDIAN_MAX_TRANSMITTANCE, NEGLIGIBLE, TRANSMITTANCE_STOP
 from vg2gt.kernels.render_cpu import tiles
 from vg2gt.kernels.render_cpu.backward import backward_color, backward_rasterized, backward_solid
 from vg2gt.kernels.render_cpu.forward import forward_color, forward_rasterized, forward_solid
@@ -29,7 +29,6 @@ from vg2gt.rendering.scenes import Images, SceneViews
 TILES_PER_ITEM = 8
 HIT_CAPACITY = 192  # hits per block of rays for the depth solver; a tile with more gets a larger buffer
 CACHE_LINE = 64  # bytes
-NEGLIGIBLE = {np.dtype(np.float32): 30.0, np.dtype(np.float64): 90.0}  # squared sigmas beyond which a profile is 0
 
 _local = threading.local()
 
@@ -175,7 +174,7 @@ def _prepare(view: _View, options: RenderOptions) -> _Lists:
 
 def _parameters(options: RenderOptions, dtype: np.dtype) -> np.ndarray:
     values = (
-        options.alpha_max, TRANSMITTANCE_STOP, MEDIAN_MAX_TRANSMITTANCE, options.near, NEGLIGIBLE[dtype],
+        options.alpha_max, TRANSMITTANCE_STOP, MEDIAN_MAX_TRANSMITTANCE, options.near, NEGLIGIBLE[dtype.itemsize],
         CONVERGED * np.finfo(dtype).eps,
     )  # fmt: skip
     return np.array(values, dtype)

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from vg2gt.kernels.constants import BRACKET_SIGMAS, CONVERGED, MEDIAN_MAX_TRANSMITTANCE, TRANSMITTANCE_STOP
+from vg2gt.kernels.constants import BRACKET_SIGMAS, CONVERGED, MEDIAN_MAX_TRANSMITTANCE, NEGLIGIBLE, TRANSMITTANCE_STOP
 from vg2gt.kernels.render_gpu import kernels as launchable
 from vg2gt.kernels.render_gpu.binning import ENTRIES
 from vg2gt.kernels.render_gpu.projection import BLOCK, REFUSED, SLOTS
@@ -23,7 +23,6 @@ from vg2gt.types import Cameras, Gaussians, Render
 
 kernels: Any = launchable  # Triton kernels are launched as kernel[grid](...), which type checkers do not know
 
-NEGLIGIBLE = {torch.float32: 30.0, torch.float64: 90.0}  # squared sigmas beyond which a profile is 0
 ROW_SHARE = 64  # gradient rows take 1 / ROW_SHARE of a GPU's memory
 ROWS = 3_000_000  # gradient rows held at once without a GPU
 SLOT_SHARE, SLOT_BYTES = 8, 256  # slots rendered at once take 1 / SLOT_SHARE; bytes per slot, with its entries
@@ -107,7 +106,7 @@ class _Render(torch.autograd.Function):
             lists.records, lists.members, lists.starts, background, color, normal, depth, alpha, transmittance, slopes,
             height, width, across, tiles,
             near=options.near, alpha_max=options.alpha_max, stop=TRANSMITTANCE_STOP,
-            negligible=NEGLIGIBLE[poses.dtype], median_max=MEDIAN_MAX_TRANSMITTANCE, sigmas=BRACKET_SIGMAS,
+            negligible=NEGLIGIBLE[poses.element_size()], median_max=MEDIAN_MAX_TRANSMITTANCE, sigmas=BRACKET_SIGMAS,
             steps=options.search_steps, newton=options.newton_steps > 0,
             converged=CONVERGED * torch.finfo(poses.dtype).eps,
             solid=solid, geometry=options.geometry, mean=options.depth == "expected", num_warps=1,
@@ -122,7 +121,7 @@ class _Render(torch.autograd.Function):
         """Returns gradients of Gaussians, cameras and background."""
         saved = ctx.saved_tensors
         means, quats, scales, opacities, sh, poses, intrinsics, _, batch = saved[:9]
-        lists = _Lists(*saved[9:14], ctx.chunks)
+        lists = _Lists(*saved[9:14], chunks=ctx.chunks)
         images = saved[14:]
         color, _, depth, transmittance, _ = images
         options: RenderOptions = ctx.options

@@ -140,7 +140,8 @@ def _run(mode: Mode, device: torch.device | None) -> tuple[list[Tensor], list[Te
     inputs = [tensor.to(**place).requires_grad_() for tensor in _fixed_scene()]
     *parameters, poses, intrinsics, background = inputs
     batch = torch.arange(SCENES, device=device).repeat_interleave(COUNT)
-    gaussians, cameras, options = Gaussians(*parameters, batch), Cameras(poses, intrinsics, SIZE), RenderOptions(mode)
+    gaussians, cameras = Gaussians(*parameters, batch=batch), Cameras(poses, intrinsics, SIZE)
+    options = RenderOptions(mode)
     if device is None:
         out = render_scenes(rasterize_dense, gaussians, cameras, background.expand(SCENES, 3), options)
     else:
