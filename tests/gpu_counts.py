@@ -165,5 +165,5 @@ def count_step(step: Callable[[], Any]) -> tuple[Counter[str], Counter[str]]:
     asked = {
         where: n for where, n in waits.places.items() if not where.startswith(("rendering/", "types.py Gaussians"))
     }
-    asked.pop("method/ptv3.py Level.__init__", None)
+    asked.pop("method/ptv3.py Level.__post_init__", None)
     return found, Counter({**asked, "rendering/gpu_tiles.py _list": 1})

@@ -8,9 +8,8 @@ import torch
 
 from backends.oracle import OracleBackend
 from tests.training_helpers import full_model, small_config
-from vg2gt.baselines.pointcloud import PointCloud
+from vg2gt.baselines import PointCloud
 from vg2gt.evaluation.protocols import ground_truth_target_cameras, training_cameras
-from vg2gt.losses import VG2GTLoss
 from vg2gt.model import VG2GT, SceneScale, with_scale_of
 from vg2gt.training.loop import Run, build
 from vg2gt.types import Batch
@@ -99,37 +98,6 @@ def test_rays_that_meet_nothing_show_the_scenes_mean_colour(run: Run, model: VG2
     other: Any = "white"
     with pytest.raises(ValueError, match=r"model\.background is 'white'; choose one of mean, black"):
         VG2GT(model.backend, SceneScale(), None, lambda **_: model.fine, lambda **_: model.gaussians, background=other)
-
-
-def test_hinge_answers_harmful_token_changes_only(run: Run, model: VG2GT, batch: Batch) -> None:
-    """The tokens move along the gradient of the decoded depth's error: uphill is punished, downhill left alone."""
-    context, backend = batch.context, model.backend
-    assert isinstance(run.module.loss, VG2GTLoss)
-    hinge_only = hinge_alone(run.module.loss)
-    tokens = backend.encode(context.images, context.hints)
-    before = model(context.images, context.hints)
-
-    def hinge(change: tuple[torch.Tensor, ...]) -> torch.Tensor:
-        patch = tuple(tap + delta for tap, delta in zip(tokens.patch, change, strict=True))
-        depth = backend.decode(tokens.with_patch(patch)).depth * before.unit[:, None, None, None]
-        return hinge_only(replace(before, geometry=replace(before.geometry, depth=depth)), context).total
-
-    error = [torch.zeros_like(tap).requires_grad_() for tap in tokens.patch]
-    scaled = tuple(tap + delta for tap, delta in zip(tokens.patch, error, strict=True))
-    wrong = (backend.decode(tokens.with_patch(scaled)).depth - context.depth).abs().mean()
-    uphill = torch.autograd.grad(wrong, error)
-    step = 3.0 / float(torch.stack([g.abs().max() for g in uphill]).max())
-    for sign, expected in ((1.0, True), (-0.1, False)):
-        change = [(sign * step * gradient).requires_grad_() for gradient in uphill]
-        loss = hinge(tuple(change))
-        gradients = torch.autograd.grad(loss, change)
-        assert (float(loss.detach()) > 0) is expected
-        assert any(bool((gradient != 0).any()) for gradient in gradients) is expected
-
-
-def hinge_alone(loss: VG2GTLoss) -> VG2GTLoss:
-    """The objective with the enhancement hinge alone."""
-    return VG2GTLoss(geometry=replace(loss.geometry, depth=0.0, point=0.0), enhance=loss.enhance)
 
 
 def test_held_out_images_never_touch_the_gaussians(model: VG2GT, batch: Batch) -> None:

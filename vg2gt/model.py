@@ -15,8 +15,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import replace
-from typing import Any, Literal, get_args
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -28,7 +28,7 @@ from vg2gt.geometry.cameras import focal_lengths, relative_to_first, scale_trans
 from vg2gt.memory import note_sizes
 from vg2gt.method.additions.visibility import Support, ViewCheck
 from vg2gt.profiling import stage
-from vg2gt.types import Cameras, Decoded, Gaussians, Geometry, Hints, Prediction, Tokens, Voxels
+from vg2gt.types import Cameras, Decoded, Gaussians, Geometry, Hints, Prediction, Tokens, Voxels, check_choice
 
 Background = Literal["mean", "black"]
 ScaleSource = Literal["metric", "focal", "normalize", "groundtruth"]
@@ -37,6 +37,7 @@ SEEN_WEIGHT = 0.01  # weight of pixels with depth in the background colour; pixe
 CANONICAL_FOCAL = 300.0  # appendix A.1: d_metric = f * d_net / 300
 
 
+@dataclass(frozen=True)
 class SceneScale:
     """Fixes the scene unit before voxelisation, with one factor per scene (paper, appendix A.1).
 
@@ -50,11 +51,11 @@ class SceneScale:
         ValueError: if the source is unknown.
     """
 
-    def __init__(self, source: ScaleSource = "normalize", median_depth: float = 1.0) -> None:
-        if source not in get_args(ScaleSource):
-            raise ValueError(f"model.scale.source is {source!r}; choose one of {', '.join(get_args(ScaleSource))}")
-        self.source = source
-        self.median_depth = median_depth
+    source: ScaleSource = "normalize"
+    median_depth: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_choice("model.scale.source", self.source, ScaleSource)
 
     def __call__(self, geometry: Geometry, hints: Hints | None) -> Tensor:
         """Returns scene units per unit of ``geometry``: ``[B]``, detached."""
@@ -101,8 +102,7 @@ class Reconstructor(nn.Module, ABC):
         visibility: ViewCheck | None = None,
     ) -> None:
         super().__init__()
-        if background not in get_args(Background):
-            raise ValueError(f"model.background is {background!r}; choose one of {', '.join(get_args(Background))}")
+        check_choice("model.background", background, Background)
         if scale.source == "metric" and not backend.is_metric:
             raise ValueError(
                 f"model.scale.source=metric requires a metric backend, but {backend.name} is not metric: "
@@ -247,19 +247,14 @@ class Reconstructor(nn.Module, ABC):
 class VG2GT(Reconstructor):
     """Feed-forward Gaussian reconstruction on a frozen backbone (paper, eqn propose).
 
+    See :class:`Reconstructor` for the other arguments; the visibility of the enhanced geometry is checked.
+
     Args:
-        backend: the frozen visual foundation model.
-        scale: fixes the scene unit.
         coarse: factory of the coarse-level feature enhancement, called with ``token_dims`` and ``patch_size``; None
             (ablation w/o Coarse) uses the backbone's geometry.
         fine: factory of the fine-level voxel module, called with ``token_dims`` and ``patch_size``.
         gaussians: factory of the self-splitting Gaussian head, called with ``in_channels``.
         keep_scale: rescales the enhanced depth to the scale of the backbone's, see :func:`with_scale_of`.
-        background: see :class:`Reconstructor`.
-        visibility: see :class:`Reconstructor`; applied to the enhanced geometry before the fine level.
-
-    Raises:
-        ValueError: if the scale is metric but the backend is not, or the background is unknown.
     """
 
     def __init__(
@@ -283,16 +278,7 @@ class VG2GT(Reconstructor):
     def forward(
         self, images: Tensor, hints: Hints | None = None, generator: torch.Generator | None = None
     ) -> Prediction:
-        """Reconstructs B scenes.
-
-        Args:
-            images: ``[B, V, 3, H, W]`` in [0, 1]; H and W multiples of the backend's patch size.
-            hints: data about the views, for backends that need it.
-            generator: draws serialisation orders of the coarse module while training.
-
-        Returns:
-            Geometry before and after enhancement, voxels and Gaussians, in scene units and the frame of view 0.
-        """
+        """See :meth:`Reconstructor.forward`; ``generator`` draws serialisation orders of the coarse module."""
         # coarse level: images [B, V, 3, H, W] to enhanced tokens [B, V, P, D] and depth [B, V, H, W]
         tokens, decoded = self.enhance(images, hints, generator)
         # ours: mask of pixels that other views do not contradict [B, V, H, W]

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 import torch
 from torch import Tensor
@@ -49,6 +49,13 @@ def _map_value(value: Any, function: Callable[[Tensor], Tensor]) -> Any:
     if isinstance(value, Mapping):
         return {key: _map_value(item, function) for key, item in value.items()}
     return value
+
+
+def check_choice(name: str, value: object, choices: Any) -> None:
+    """Raises ValueError, naming the choices, unless ``value`` is one of a tuple or of the values of a ``Literal``."""
+    known = get_args(choices) or choices
+    if value not in known:
+        raise ValueError(f"{name} is {value!r}; choose one of {', '.join(known)}")
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ import torch
 from tests.evaluation.conftest import without_cost
 from vg2gt.evaluation.evaluator import MODES, PROTOCOLS, EvaluationOptions, PointOptions, SceneEvaluator, SceneResult
 from vg2gt.evaluation.in_training import evaluate_scene
+from vg2gt.evaluation.pictures import PANELS, scene_picture
 from vg2gt.evaluation.protocols import ground_truth_target_cameras, joint_target_cameras
 from vg2gt.evaluation.scene_metrics import align_geometry, image_metrics, point_cloud_metrics
 from vg2gt.geometry.alignment import Similarity
@@ -86,14 +87,9 @@ def test_without_true_depth_what_needs_it_is_none_and_not_zero(evaluator, batch:
     assert "points/decoded/chamfer" not in scores
 
 
-def test_without_targets_or_true_cameras(evaluator: SceneEvaluator, batch: Batch) -> None:
+def test_without_targets_or_pairs_of_views(evaluator: SceneEvaluator, batch: Batch) -> None:
     inputs_only = evaluator(batch.context)
     assert set(inputs_only.renders) == {"context"}
-    unposed = evaluator(batch, has_cameras=False)
-    assert set(unposed.renders) == {"context", "novel"}
-    assert not any(name.startswith(("cameras", "points", "rendered/gt_pose")) for name in unposed.metrics)
-    assert "rendered/novel/solid/psnr" in unposed.metrics
-    assert not any("normal" in name for name in unposed.metrics)
     one_view = replace(batch, num_context=1)
     assert "cameras/auc_5" not in evaluator(one_view).metrics
 
@@ -142,7 +138,7 @@ def test_points_of_unknown_pixels_are_not_wrong(batch: Batch) -> None:
 def test_wrong_options_are_named() -> None:
     bounds = [(5, 1), (None, 0), (-1, None), (2, 2)]
     cases = [({"depth_range": each}, "depth_range=.* leaves no depth") for each in bounds]
-    cases += [({"alignment": "affine"}, "alignment='affine'")]
+    cases += [({"alignment": "affine"}, "alignment is 'affine'")]
     for options, told in cases:
         with pytest.raises(ValueError, match=told):
             EvaluationOptions(**options)
@@ -208,3 +204,13 @@ def test_the_figures_of_training_runs(module_and_batch, batch: Batch) -> None:
     assert found["edge_psnr"] < found["psnr"]
     with pytest.raises(ValueError, match="held-out views"):
         evaluate_scene(module.model, module.renderer, batch.context)
+
+
+def test_a_grid_of_all_panels(result: SceneResult, batch: Batch) -> None:
+    render = result.renders["gt_pose"]
+    columns, gap, (height, width) = len(PANELS.split("|")), 4, batch.images.shape[-2:]
+    picture = scene_picture(batch, render, batch.target)
+    assert picture.shape == (3, 3 * (height + gap) - gap, columns * (width + gap) - gap)
+    assert picture.min() >= 0
+    assert picture.max() <= 1
+    torch.testing.assert_close(picture[:, :height, -width:], batch.target.images[0, 0])

@@ -76,11 +76,11 @@ def test_the_untrained_head_says_so_and_scores_otherwise(tmp_path: Path, cache: 
 def test_an_interrupted_evaluation_goes_on(tmp_path, cache, trained, evaluated, monkeypatch):
     original, seen = SceneEvaluator.__call__, []
 
-    def counted(self, batch, has_cameras=True):
+    def counted(self, batch):
         seen.append(batch.scene[0])
         if len(seen) == 2:
             raise InterruptedError("simulated crash")
-        return original(self, batch, has_cameras)
+        return original(self, batch)
 
     monkeypatch.setattr(SceneEvaluator, "__call__", counted)
     with pytest.raises(InterruptedError):

@@ -1,15 +1,18 @@
 """A calibration made of rooms, found again next to its checkpoint, and scored on others."""
 
 import json
+import math
 from pathlib import Path
 
 import pytest
+import torch
 
 from tests.evaluation.conftest import evaluate_overrides
 from tests.training_helpers import small_config
 from vg2gt.config import compose
 from vg2gt.evaluation.calibrate import make_calibration
 from vg2gt.evaluation.run import evaluate
+from vg2gt.evaluation.scene_metrics import ause, stated_error_metrics
 from vg2gt.runs.load import load_model
 from vg2gt.training.loop import train
 
@@ -56,3 +59,18 @@ def test_it_needs_a_place_and_enough_scenes(cache: Path) -> None:
     few = ["data.eval_scenes=2", "backend=oracle", "model=tiny", "out=nowhere.json"]
     with pytest.raises(ValueError, match="2 scenes"):
         make_calibration(compose("calibrate", *overrides(cache, *few)))
+
+
+def test_coverage_width_and_order() -> None:
+    error = torch.tensor([0.01, 0.02, 0.03, 0.04])
+    bounds = torch.tensor([[0.02] * 4, [0.02] * 4, [0.02, 0.01, 0.05, 0.05], [0.05] * 4])
+    found = stated_error_metrics(error, bounds)
+    assert (found["held_50"], found["held_90"]) == (0.5, 0.75)
+    assert found["width_90"] == pytest.approx(0.0325)
+    assert math.isnan(stated_error_metrics(torch.zeros(0), torch.zeros(4, 0))["ause"])  # nothing to score
+    error = torch.rand(1000, generator=torch.Generator().manual_seed(0))
+    assert ause(error, 3 * error) == pytest.approx(0, abs=1e-9)
+    shuffled = ause(error, torch.rand(1000, generator=torch.Generator().manual_seed(1)))
+    assert 0.2 < shuffled < ause(error, -error)
+    # Uniform errors left out at random keep their mean, left out by size the largest goes down: 1 - (1 - mean(share)).
+    assert shuffled == pytest.approx(0.475, abs=0.05)

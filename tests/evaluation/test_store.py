@@ -3,8 +3,7 @@ from pathlib import Path
 import pytest
 
 from vg2gt.data.views import SceneSample
-from vg2gt.evaluation.run import mean_metrics
-from vg2gt.evaluation.store import ResultStore
+from vg2gt.evaluation.run import ResultStore, mean_metrics
 
 VIEWS = SceneSample("kitchen/seq-01", (1, 2), (3,))
 

@@ -106,20 +106,6 @@ def test_processes_that_compile_at_once_never_run_each_others_code(make) -> None
     assert repr((third(1), third(1.5))) == "(2, 2.5)"  # 2, not 2.0
 
 
-@pytest.mark.parametrize("ending", ["nbc", "nbi"])
-def test_a_damaged_file_is_compiled_again(ending: str, tmp_path: Path, make, caplog: pytest.LogCaptureFixture) -> None:
-    make()(1)
-    (file,) = (tmp_path / "cache").rglob(f"*.{ending}")
-    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
-    assert make()(1) == 2
-    assert "compiling it again" in caplog.text
-    caplog.clear()
-    last = make()
-    assert last(1) == 2
-    assert not last.stats.cache_misses
-    assert not caplog.records
-
-
 def test_kernels_take_what_they_need_from_their_own_room() -> None:
     """Else the hash would not know of it. Functions of ``numba.njit`` are inlined into kernels and not kept."""
     wrong, kernels = [], 0

@@ -57,20 +57,6 @@ def test_colour_and_depth_terms_by_hand(case) -> None:
     torch.testing.assert_close(GaussianLoss()(replace(rendered, depth=depth), *case[1:]), terms)
 
 
-def test_ssim_by_hand(case) -> None:
-    rendered, _, targets, _ = case
-    offsets = torch.arange(-5, 6, dtype=torch.float64)
-    g = torch.exp(-offsets.square() / (2 * 1.5**2))
-    window = torch.outer(g, g) / g.sum().square()
-    pad = lambda image: torch.nn.functional.pad(image, (5, 5, 5, 5), mode="reflect")  # noqa: E731
-    x, y = (pad(image).unfold(2, 11, 1).unfold(3, 11, 1) for image in (rendered.color[0], targets.images))
-    mean = lambda patches: (patches * window).sum((-2, -1))  # noqa: E731
-    mx, my = mean(x), mean(y)
-    vx, vy, cov = mean(x * x) - mx**2, mean(y * y) - my**2, mean(x * y) - mx * my
-    value = (2 * mx * my + 0.01**2) * (2 * cov + 0.03**2) / ((mx**2 + my**2 + 0.01**2) * (vx + vy + 0.03**2))
-    torch.testing.assert_close(GaussianLoss()(*case)["ssim"], 1 - value.mean(), rtol=1e-5, atol=1e-6)
-
-
 @pytest.mark.parametrize("target", ["render", "decoded", "gt"])
 def test_normals_are_compared_with_the_chosen_depth_map(case, target: str) -> None:
     rendered, cameras, targets, _ = case

@@ -1,6 +1,5 @@
 """VGGT's terms against straightforward re-derivations on point maps."""
 
-import math
 from dataclasses import replace
 
 import pytest
@@ -12,7 +11,6 @@ from vg2gt.geometry.cameras import scale_translations, unproject
 from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.losses import GeometryLoss
 from vg2gt.losses.geometry import (
-    camera_errors,
     depth_gradient_loss,
     order_statistic,
     point_normal_loss,
@@ -177,21 +175,6 @@ def test_truth_is_divided_by_the_mean_distance_in_the_first_frame(sample) -> Non
     again = normalize_truth(replace(batch, depth=depth * 7, cameras=larger))
     torch.testing.assert_close(again.depth, truth.depth, rtol=1e-6, atol=1e-6)
     torch.testing.assert_close(again.cameras.world_to_camera, truth.cameras.world_to_camera, rtol=1e-6, atol=1e-6)
-
-
-def test_camera_errors_by_hand() -> None:
-    identity = torch.eye(4, dtype=torch.float64).repeat(1, 1, 1, 1)
-    turned = identity.clone()
-    cosine, sine = math.cos(0.1), math.sin(0.1)
-    turned[..., :3, :3] = quat_to_matrix(torch.tensor([cosine, sine, 0, 0], dtype=torch.float64))
-    turned[..., 0, 3] = 0.3
-    intrinsics = torch.tensor([[50.0, 0, 20], [0, 25, 10], [0, 0, 1]], dtype=torch.float64).repeat(1, 1, 1, 1)
-    wider = intrinsics.clone()
-    wider[..., 0, 0] = 25
-    errors = camera_errors(Cameras(turned, wider, (50, 100)), Cameras(identity, intrinsics, (50, 100)))
-    assert math.isclose(float(errors["camera_T"]), 0.1, rel_tol=1e-9)
-    assert math.isclose(float(errors["camera_R"]), (1 - cosine + sine) / 4, rel_tol=1e-6)
-    assert math.isclose(float(errors["camera_F"]), (math.atan(2) - math.atan(1)), rel_tol=1e-9)
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 2e-5)])

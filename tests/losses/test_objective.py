@@ -122,18 +122,11 @@ def test_a_scene_without_depth_still_trains_its_colours(sample, align: ScaleAlig
         assert bool(leaf.grad[1].any()) is (name not in ("depth", "conf")), name
 
 
-def test_cameras_are_logged_and_not_trained(sample) -> None:
-    made = noisy(sample())
-    base = VG2GTLoss()(*made.inputs)
+def test_the_total_is_the_weighted_sum_of_the_terms(sample) -> None:
+    base = VG2GTLoss()(*noisy(sample()).inputs)
     weights = dict.fromkeys([*DEPTH_TERMS, *GAUSSIAN_TERMS], 1.0) | {"enhance_depth": 3.0, "enhance_point": 3.0}
     torch.testing.assert_close(base.total, sum(weight * base.terms[name] for name, weight in weights.items()))
     assert not any(value.requires_grad for value in base.terms.values())
-    cameras = made.prediction.geometry.cameras
-    intrinsics = cameras.intrinsics.clone()
-    intrinsics[..., 0, 0] *= 1.1
-    geometry = replace(made.prediction.geometry, cameras=replace(cameras, intrinsics=intrinsics))
-    moved = replace(made, prediction=replace(made.prediction, geometry=geometry))
-    assert float(VG2GTLoss()(*moved.inputs).terms["camera_F"]) > 0.01 > float(base.terms["camera_F"])
 
 
 def test_term_weights_reach_the_total(sample) -> None:

@@ -94,7 +94,7 @@ def test_bad_cameras_are_refused_by_name() -> None:
         render(soup(5), Cameras(cameras.world_to_camera * float("nan"), cameras.intrinsics, (4, 4)))
     with pytest.raises(ValueError, match=r"^intrinsics must be"):
         render(soup(5), Cameras(cameras.world_to_camera, -cameras.intrinsics, (4, 4)))
-    with pytest.raises(ValueError, match=r"^world_to_camera must be \[B, V, 4, 4\]"):
+    with pytest.raises(ValueError, match=r"^world_to_camera must be"):
         render(soup(5), Cameras(cameras.world_to_camera[0], cameras.intrinsics, (4, 4)))
 
 

@@ -3,6 +3,7 @@
 import threading
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -159,3 +160,13 @@ def test_rasterized_median_moves_with_one_gaussian_only() -> None:
     (grad,) = torch.autograd.grad(out.depth[0, 0, row, column], gaussians.means)
     assert (grad.abs().sum(-1) > 0).sum() == 1
     assert float(grad[:, 2].sum()) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("count", [0, 1, 3000])
+def test_equal_depths_keep_their_order(dtype: type[np.floating], count: int) -> None:
+    depths = np.random.default_rng(count).lognormal(1, 3, count).astype(dtype)
+    depths[::3] = depths[: len(depths[::3])].round(1) + dtype(0.01)
+    order = tiles.depth_order(depths)
+    assert order.tolist() == sorted(range(count), key=lambda i: (depths[i], i))
+    assert count < 2 or len(set(depths.tolist())) < count

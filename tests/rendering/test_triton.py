@@ -131,8 +131,8 @@ def test_gradients_are_the_same_however_many_views_are_held_at_once(monkeypatch:
     _, expected = render_with_gradients(gaussians, cameras, DEVICE, **options)
     assert gpu_tiles._chunks([4, 4, 9, 10], 5) == ((0, 2, 0, 4), (2, 1, 4, 9), (3, 1, 9, 10))
     assert gpu_tiles._chunks([9, 18], 5) == ((0, 1, 0, 9), (1, 1, 9, 18))
-    monkeypatch.setattr(gpu_tiles, "_rows_at_once", lambda device: 5)
-    monkeypatch.setattr(gpu_tiles, "_slots_at_once", lambda device: 2 * len(gaussians))  # two views, then one
+    held = {gpu_tiles.ROWS: 5, gpu_tiles.SLOTS: 2 * len(gaussians)}  # two views, then one
+    monkeypatch.setattr(gpu_tiles, "_at_once", lambda device, otherwise, each: held[otherwise])
     _, grads = render_with_gradients(gaussians, cameras, DEVICE, **options)
     for name, grad in expected.items():
         torch.testing.assert_close(grads[name], grad, rtol=1e-12, atol=1e-12)  # summed in another order

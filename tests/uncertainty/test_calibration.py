@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from vg2gt.evaluation.scene_metrics import ause
 from vg2gt.io.errors import FormatError
-from vg2gt.metrics import ause
 from vg2gt.uncertainty import LEVELS, Calibration, Samples, Status, calibrate, read_calibration
 from vg2gt.uncertainty.calibration import MEASURED
 from vg2gt.uncertainty.evidence import EVIDENCE

@@ -120,7 +120,7 @@ def test_cap_keeps_the_most_confident_and_says_so(make_fine, make_room, caplog):
 def test_without_gradient_views_are_pooled_a_few_at_a_time_to_the_same_voxels(make_fine, make_room):
     tokens, geometry, images = make_room(scenes=2, views=3)
     geometry.depth[0, 1, :20] = 0  # pixels that no voxel uses
-    module = make_fine()
+    module = make_fine(moments=True)
     whole = module(tokens, geometry, images)
     seen = []
     decode = module.dense_head._decode
@@ -131,11 +131,15 @@ def test_without_gradient_views_are_pooled_a_few_at_a_time_to_the_same_voxels(ma
     assert seen == [2, 2, 2]
     assert torch.equal(chunked.grid, whole.grid)
     torch.testing.assert_close(chunked.features, whole.features, atol=1e-5, rtol=1e-5)
+    for found, expected in zip(vars(chunked.moments).values(), vars(whole.moments).values(), strict=True):
+        torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
 
 
 def test_moments_are_the_covariances_of_the_pixels(make_fine, make_room):
     tokens, geometry, images = make_room(scenes=2)
-    voxels = make_fine(moments=True)(tokens, geometry, images)
+    module = make_fine(moments=True)
+    module.dense_head.views_per_chunk = 4  # of six
+    voxels = module(tokens, geometry, images)
     points = unproject(geometry.depth, geometry.cameras)
     focal = geometry.cameras.intrinsics[0, 0, 0, 0]
     for scene in (0, 1):

@@ -3,16 +3,7 @@ import math
 import pytest
 import torch
 
-from vg2gt.method import grid
-from vg2gt.method.grid import (
-    mixed_radix_keys,
-    plan_voxels,
-    point_cells,
-    pool_mean,
-    pool_min,
-    scene_voxel_size,
-    warn_if_sparse,
-)
+from vg2gt.method.grid import mixed_radix_keys, plan_voxels, point_cells, pool_mean, pool_min, scene_voxel_size
 from vg2gt.types import Cameras, Geometry
 
 SIZE = torch.tensor([0.125, 0.25])
@@ -97,17 +88,3 @@ def test_voxel_size_guard():
     geometry = Geometry(depth, torch.ones_like(depth), cameras, torch.ones(2))
     for options, sizes in (((0.002, 1.5), [0.06, 0.002]), ((0.1, 1.5), [0.1, 0.1]), ((0.002, 0), [0.002, 0.002])):
         torch.testing.assert_close(scene_voxel_size(geometry, *options), torch.tensor(sizes))
-
-
-@pytest.mark.parametrize(("shared", "module", "warned"), [(1, "fine", True), (2, "fine", False), (1, "coarse", False)])
-def test_the_sparsest_scene_decides_whether_voxels_are_sparse(shared, module, warned, monkeypatch, caplog):
-    """Scene 0 has ten points in one voxel, scene 1 seven voxels of one point each and ``shared`` points more in one."""
-    monkeypatch.setattr(grid, "_warned_of_sparse", set())
-    cells = torch.zeros(17 + shared, 3, dtype=torch.float64)
-    cells[10:17, 0] = torch.arange(7)
-    cells[17:, 0] = 6
-    batch = (torch.arange(len(cells)) >= 10).long()
-    plan = plan_voxels(cells, batch, torch.ones_like(batch, dtype=torch.bool))
-    for _ in range(2):
-        warn_if_sparse(plan, 2, module)
-    assert [record.args for record in caplog.records] == [("fine", pytest.approx(8 / 7), "fine", "fine")] * warned

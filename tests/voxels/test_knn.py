@@ -3,7 +3,7 @@ import torch
 from scipy.spatial import KDTree
 
 from vg2gt.method import knn
-from vg2gt.method.knn import interpolate, interpolation_weights, nearest_by_cells, nearest_neighbors
+from vg2gt.method.knn import interpolate, interpolation_weights, nearest_by_cells
 
 
 @pytest.fixture(params=["trees", "cells"], autouse=True)
@@ -61,7 +61,6 @@ def test_cells_find_what_a_tree_finds(cloud, neighbors, monkeypatch):
 @pytest.mark.parametrize("count", [1, 2, 15])
 def test_fewer_points_than_neighbours(count):
     queries, cloud = points(5, 0), points(count, 1)
-    assert nearest_neighbors(queries, cloud, 16).shape == (5, count)
     zeros = torch.zeros(5, dtype=torch.int64)
     index, weights = interpolation_weights(queries, zeros, cloud, zeros.new_zeros(count), 16, 1)
     assert index.shape == weights.shape == (5, 16)

@@ -2,6 +2,6 @@
 
 from vg2gt.baselines.da3_gaussians import DA3Gaussians
 from vg2gt.baselines.pixel_aligned import PixelAligned, PixelHead, VoxelMerged
-from vg2gt.baselines.pointcloud import PointCloud
+from vg2gt.baselines.pixels import PointCloud
 
 __all__ = ["DA3Gaussians", "PixelAligned", "PixelHead", "PointCloud", "VoxelMerged"]

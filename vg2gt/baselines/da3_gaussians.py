@@ -13,10 +13,11 @@ from backends.base import Backend
 from backends.da3 import DA3Backend
 from backends.dpt import DPT
 from backends.network import normalize_images
-from vg2gt.baselines.pixels import SMALLEST_FOOTPRINT, PixelReconstructor, Pixels, ReadViews, harmonic_gains
+from vg2gt.baselines.pixels import SMALLEST_FOOTPRINT, PixelReconstructor, Pixels, ReadViews
 from vg2gt.geometry.precision import full_precision
 from vg2gt.geometry.rotations import matrix_to_quat, multiply_quats
 from vg2gt.method.additions.visibility import ViewCheck
+from vg2gt.method.gaussian_head import harmonic_gains
 from vg2gt.model import Background, SceneScale
 from vg2gt.types import Cameras, Gaussians, Geometry, Hints, Tokens
 

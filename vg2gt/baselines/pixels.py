@@ -1,22 +1,28 @@
-"""Usable pixels of all views as one packed list, and a base class for models with per-pixel Gaussians."""
+"""Usable pixels of all views as one packed list, a base class for models with per-pixel Gaussians, and the simplest."""
 
 from __future__ import annotations
 
 import math
 from abc import abstractmethod
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
 
+from backends.base import Backend
 from vg2gt.geometry.cameras import invert_rigid, ray_directions
-from vg2gt.geometry.spherical_harmonics import rotation_of_coefficients
-from vg2gt.model import Reconstructor
+from vg2gt.geometry.spherical_harmonics import rgb_to_sh, rotation_of_coefficients
+from vg2gt.method.additions.visibility import ViewCheck
+from vg2gt.method.knn import nearest_in_scenes
+from vg2gt.model import Background, Reconstructor, SceneScale
 from vg2gt.profiling import stage
-from vg2gt.types import Gaussians, Geometry, Hints, Prediction, TensorRecord, Tokens
+from vg2gt.types import Gaussians, Geometry, Hints, Prediction, TensorRecord, Tokens, check_choice
 
 ReadViews = tuple[Tokens, Geometry, Tensor]
 SMALLEST_FOOTPRINT = 1e-7  # scene units; a hundredth of it is still a valid scale for the renderer
+Spacing = Literal["pixel", "neighbors"]
+NEIGHBORS = 3
 
 
 @dataclass(frozen=True)
@@ -88,12 +94,6 @@ def usable_pixels(geometry: Geometry, images: Tensor) -> Pixels:
     )
 
 
-def harmonic_gains(degree: int) -> Tensor:
-    """Returns factors ``[(degree + 1)^2, 1]`` that make predicted SH coefficients of higher degrees start small."""
-    degrees = [each for each in range(degree + 1) for _ in range(2 * each + 1)]
-    return torch.tensor([0.1 * 0.25**each if each else 1.0 for each in degrees])[:, None]
-
-
 class PixelReconstructor(Reconstructor):
     """Base class of models that make Gaussians of pixels; geometry is the backbone's own.
 
@@ -128,3 +128,59 @@ class PixelReconstructor(Reconstructor):
             pixels: the same N pixels.
             views: result of :meth:`vg2gt.model.Reconstructor.read_views`.
         """
+
+
+class PointCloud(PixelReconstructor):
+    """One isotropic Gaussian per pixel, as wide as the spacing of the points.
+
+    See :class:`vg2gt.model.Reconstructor` for the other arguments.
+
+    Args:
+        spacing: ``pixel``: size of the pixel at its depth. ``neighbors``: root mean square distance to the three
+            nearest points; with ``opacity=0.1`` this is the 3DGS initialisation from a point cloud.
+        width: standard deviation relative to the spacing.
+        opacity: opacity of every Gaussian, in (0, 1).
+
+    Raises:
+        ValueError: if the spacing is unknown.
+    """
+
+    def __init__(
+        self,
+        backend: Backend,
+        scale: SceneScale,
+        spacing: Spacing = "pixel",
+        width: float = 0.5,
+        opacity: float = 0.9,
+        background: Background = "black",
+        visibility: ViewCheck | None = None,
+    ) -> None:
+        check_choice("model.spacing", spacing, Spacing)
+        super().__init__(backend, scale, background, visibility)
+        self.spacing = spacing
+        self.width = width
+        self.opacity = opacity
+
+    def make_gaussians(self, features: Tensor, pixels: Pixels, views: ReadViews) -> Gaussians:
+        """Returns one Gaussian per pixel; uses no features."""
+        means = pixels.to_world(pixels.rays * pixels.depth[:, None])
+        spacing = pixels.footprint.mean(-1) if self.spacing == "pixel" else _distance_to_neighbors(means, pixels)
+        return Gaussians(
+            means=means,
+            quats=means.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(means), 1),
+            scales=(self.width * spacing)[:, None].repeat(1, 3),
+            opacities=torch.full_like(spacing, self.opacity),
+            sh=rgb_to_sh(pixels.colors)[:, None],
+            batch=pixels.batch,
+        )
+
+
+def _distance_to_neighbors(means: Tensor, pixels: Pixels) -> Tensor:
+    """Returns each point's RMS distance ``[N]`` to its nearest neighbours in the scene, at least 1 % of a pixel."""
+    if not len(means):
+        return means[:, 0]
+    scenes = int(pixels.batch[-1]) + 1
+    index, found = nearest_in_scenes(means, pixels.batch, means, pixels.batch, NEIGHBORS + 1, scenes)
+    squared = (means[index] - means[:, None]).square().sum(-1) * found  # [N, 4], the nearest is the point itself
+    distance = (squared.sum(1) / (found.sum(1) - 1).clamp(min=1)).sqrt()
+    return torch.maximum(distance, 0.01 * pixels.footprint.mean(-1))

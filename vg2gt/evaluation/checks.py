@@ -73,10 +73,10 @@ def _ancestry(checkpoint: Path | None) -> Iterator[tuple[Path, DictConfig]]:
 
 
 def refuse_without_hints(model: Reconstructor, source: SceneSource) -> None:
-    """Raises DataError if the data lacks the depth or cameras that a backbone needs."""
+    """Raises DataError if the data lacks cameras, or the depth that a backbone needs."""
     backend, sparse = model.backend, source.has_depth and not source.dense_depth
     lacking = ["depth"] if backend.needs_depth and (sparse or not source.has_depth) else []
-    lacking += ["cameras"] if backend.needs_hints and not source.has_cameras else []
+    lacking += [] if source.has_cameras else ["cameras"]
     if lacking:
         raise DataError(
             f"backend {backend.name} needs the data's {' and '.join(lacking)}, and {type(source).__name__} has none"

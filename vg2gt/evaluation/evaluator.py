@@ -14,9 +14,10 @@ from vg2gt.evaluation.protocols import ground_truth_target_cameras, joint_target
 from vg2gt.evaluation.scene_metrics import (
     align_geometry,
     image_metrics,
+    pixels_with_errors,
     point_cloud_metrics,
     rendered_normal_metrics,
-    stated_metrics,
+    stated_error_metrics,
 )
 from vg2gt.geometry.precision import half_precision_on_gpu
 from vg2gt.metrics import LPIPS, camera_metrics, cv, depth_metrics
@@ -25,7 +26,7 @@ from vg2gt.model import Reconstructor
 from vg2gt.profiling import clocked, now, peak_memory_mib, reset_peak_memory
 from vg2gt.refinement import Observations, RefineOptions, refine
 from vg2gt.rendering import Renderer
-from vg2gt.types import Batch, Cameras, Prediction, Render
+from vg2gt.types import Batch, Cameras, Prediction, Render, check_choice
 from vg2gt.uncertainty import Calibration
 
 MODES = ("solid", "rasterized")
@@ -80,8 +81,7 @@ class EvaluationOptions:
     table: str | None = None
 
     def __post_init__(self) -> None:
-        if self.alignment not in ALIGNMENTS:
-            raise ValueError(f"evaluation.alignment={self.alignment!r}: choose one of {', '.join(ALIGNMENTS)}")
+        check_choice("evaluation.alignment", self.alignment, ALIGNMENTS)
         if not 0 <= self.nearest < self.farthest:
             raise ValueError(
                 f"evaluation.depth_range={list(self.depth_range)} leaves no depth: give [nearest,farthest] with "
@@ -135,12 +135,11 @@ class SceneEvaluator:
     calibration: Calibration | None = None
 
     @torch.no_grad()
-    def __call__(self, batch: Batch, has_cameras: bool = True) -> SceneResult:
+    def __call__(self, batch: Batch) -> SceneResult:
         """Evaluates one scene.
 
         Args:
             batch: one scene (B = 1) on the model's device.
-            has_cameras: whether the true cameras are known; metrics that need them are left out otherwise.
 
         Raises:
             ValueError: if the batch holds several scenes.
@@ -148,10 +147,10 @@ class SceneEvaluator:
         if len(batch.scene) != 1:
             raise ValueError(f"evaluation takes one scene at a time, got {', '.join(batch.scene)}")
         prediction, cost = self._reconstruct(batch)
-        metrics, renders = self._score(batch, prediction, cost, has_cameras)
+        metrics, renders = self._score(batch, prediction, cost)
         if self.refinement is not None:
             refined, cost = self._refine(batch, prediction, self.refinement)
-            scores, _ = self._score(batch, refined, cost, has_cameras)
+            scores, _ = self._score(batch, refined, cost)
             # refinement does not change the decoded depth
             kept = {name: value for name, value in scores.items() if not name.startswith(("decoded", "stated"))}
             metrics |= _under("refined", kept)
@@ -159,7 +158,7 @@ class SceneEvaluator:
         return SceneResult(finite, prediction, renders)
 
     def _score(
-        self, batch: Batch, prediction: Prediction, cost: dict[str, float], has_cameras: bool
+        self, batch: Batch, prediction: Prediction, cost: dict[str, float]
     ) -> tuple[dict[str, float], dict[str, Render]]:
         """All metrics of one prediction, and its solid renders by protocol."""
         inside = (batch.depth >= self.options.nearest) & (batch.depth <= self.options.farthest)
@@ -167,15 +166,14 @@ class SceneEvaluator:
         metrics: dict[str, float] = {}
         renders: dict[str, Render] = {}
         device = batch.images.device
-        for protocol, cameras in self._cameras(batch, prediction, has_cameras).items():
+        for protocol, cameras in self._cameras(batch, prediction).items():
             truth = known.context if protocol == "context" else known.target
             for mode in MODES:
                 began = now(device)
                 rendered = render_or_nan(self.renderer, prediction.gaussians, cameras, mode)
                 seconds = (now(device) - began) / cameras.world_to_camera.shape[1]
                 found = image_metrics(rendered, truth, self.lpips) | self._depth_metrics(rendered.depth, truth)
-                if has_cameras:
-                    found |= rendered_normal_metrics(rendered, truth)
+                found |= rendered_normal_metrics(rendered, truth)
                 metrics |= _under(f"rendered/{protocol}/{mode}", found)
                 if mode == "solid":
                     renders[protocol] = rendered
@@ -184,10 +182,10 @@ class SceneEvaluator:
         metrics |= _under("decoded/after", self._depth_metrics(prediction.geometry.depth, known.context))
         if self.calibration is not None:
             predicts = self.model.backend.predicts_cameras
-            stated = stated_metrics(self.calibration, prediction, prediction.supported, known.context, predicts)
-            metrics |= _under("stated", stated)
-        if has_cameras:
-            metrics |= self._pose_and_point_cloud_metrics(known.context, prediction, renders["context"])
+            pixels = pixels_with_errors(prediction, prediction.supported, known.context, predicts)
+            bounds = self.calibration.bounds(pixels.evidence, pixels.status)
+            metrics |= _under("stated", stated_error_metrics(pixels.error, bounds))
+        metrics |= self._pose_and_point_cloud_metrics(known.context, prediction, renders["context"])
         cost["cv"] = cv(prediction.gaussians.means, self.options.neighbors, CV_QUERIES)
         return metrics | _under("scene", cost), renders
 
@@ -225,12 +223,11 @@ class SceneEvaluator:
             "peak_memory_mib": peak_memory_mib(device),
         }
 
-    def _cameras(self, batch: Batch, prediction: Prediction, has_cameras: bool) -> dict[str, Cameras]:
+    def _cameras(self, batch: Batch, prediction: Prediction) -> dict[str, Cameras]:
         cameras = {"context": prediction.geometry.cameras}
         if batch.images.shape[1] > batch.num_context:
             cameras["novel"] = joint_target_cameras(self.model, batch, prediction)
-            if has_cameras:
-                cameras["gt_pose"] = ground_truth_target_cameras(batch, prediction)
+            cameras["gt_pose"] = ground_truth_target_cameras(batch, prediction)
         return cameras
 
     def _depth_metrics(self, depth: torch.Tensor, truth: Batch) -> dict[str, float]:

@@ -17,7 +17,7 @@ from vg2gt.geometry.precision import full_precision
 from vg2gt.metrics import cv, depth_metrics
 from vg2gt.model import Reconstructor
 from vg2gt.rendering import Renderer, UnrenderableError
-from vg2gt.types import Batch, Cameras, Gaussians, Prediction, Render
+from vg2gt.types import Batch, Cameras, Gaussians, Render
 
 log = logging.getLogger(__name__)
 
@@ -48,32 +48,28 @@ def evaluate_scene(
     if len(batch.scene) != 1 or not held_out:
         raise ValueError(f"evaluation takes one scene with held-out views, got {batch.scene} with {held_out} of them")
     prediction = model(batch.context.images, batch.context.hints)
-    with full_precision(batch.images):
-        return _scene_figures(prediction, renderer, batch, rasterized)
-
-
-def _scene_figures(prediction: Prediction, renderer: Renderer, batch: Batch, rasterized: bool) -> dict[str, float]:
     target = batch.target
-    cameras = ground_truth_target_cameras(batch, prediction)
-    rendered = render_or_nan(renderer, prediction.gaussians, cameras, "solid")
-    depth = depth_metrics(rendered.depth[0], target.depth[0], "scene")
 
     def abs_rel(found: torch.Tensor, truth: Batch) -> float:
         return depth_metrics(found[0], truth.depth[0], "scene")["abs_rel"]
 
-    metrics = {
-        **image_metrics(rendered, target),
-        **{name: depth[name] for name in ("rmse", "abs_rel", "delta_1.25", "delta_1.05", "coverage")},
-        "normal_mean": rendered_normal_metrics(rendered, target)["normal_mean"],
-        "decoded_abs_rel_before": abs_rel(prediction.initial.depth, batch.context),
-        "decoded_abs_rel": abs_rel(prediction.geometry.depth, batch.context),
-        **edge_metrics(rendered, target, "scene"),
-        "gaussians": float(len(prediction.gaussians)),
-        "cv": cv(prediction.gaussians.means, max_queries=CV_QUERIES),
-    }
-    if rasterized:
-        flat = render_or_nan(renderer, prediction.gaussians, cameras, "rasterized")
-        metrics["abs_rel_rasterized"] = abs_rel(flat.depth, target)
+    with full_precision(batch.images):
+        cameras = ground_truth_target_cameras(batch, prediction)
+        rendered = render_or_nan(renderer, prediction.gaussians, cameras, "solid")
+        depth = depth_metrics(rendered.depth[0], target.depth[0], "scene")
+        metrics = {
+            **image_metrics(rendered, target),
+            **{name: depth[name] for name in ("rmse", "abs_rel", "delta_1.25", "delta_1.05", "coverage")},
+            "normal_mean": rendered_normal_metrics(rendered, target)["normal_mean"],
+            "decoded_abs_rel_before": abs_rel(prediction.initial.depth, batch.context),
+            "decoded_abs_rel": abs_rel(prediction.geometry.depth, batch.context),
+            **edge_metrics(rendered, target, "scene"),
+            "gaussians": float(len(prediction.gaussians)),
+            "cv": cv(prediction.gaussians.means, max_queries=CV_QUERIES),
+        }
+        if rasterized:
+            flat = render_or_nan(renderer, prediction.gaussians, cameras, "rasterized")
+            metrics["abs_rel_rasterized"] = abs_rel(flat.depth, target)
     return metrics
 
 

@@ -1,8 +1,12 @@
-"""Runs an evaluation, from its configuration to its report."""
+"""Runs an evaluation, from its configuration to its report.
+
+Results of single scenes are written as they are computed, so that an interrupted evaluation can resume.
+"""
 
 from __future__ import annotations
 
 import logging
+import shutil
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
@@ -23,8 +27,7 @@ from vg2gt.evaluation.checks import refuse_training_views, refuse_without_hints
 from vg2gt.evaluation.evaluator import EvaluationOptions, SceneEvaluator
 from vg2gt.evaluation.pictures import PANELS, scene_picture
 from vg2gt.evaluation.sections import report_markdown
-from vg2gt.evaluation.store import ResultStore
-from vg2gt.io.files import write_json, write_text
+from vg2gt.io.files import read_json, write_json, write_text
 from vg2gt.io.images import write_png
 from vg2gt.memory import EVALUATION, memory_advice
 from vg2gt.metrics import LPIPS, WeightsNotFoundError, load_lpips
@@ -39,6 +42,11 @@ log = logging.getLogger(__name__)
 FREE = ("views", "name", "output_dir", "overwrite", "ckpt", "device", "evaluation.pictures", "data.eval_scenes")
 FREE += ("data.workers", "data.memory_mb", "data.steps_per_epoch")
 REFINEMENT = ("refine.", "evaluation.refine")  # have no effect without refinement
+
+IDENTITY = "identity.json"
+FOLDERS = ("scenes", "pictures")
+REPORTS = ("metrics.json", "metrics.md")
+WRITTEN = (*FOLDERS, *REPORTS, "config.yaml")
 
 
 @memory_advice(EVALUATION)
@@ -57,54 +65,50 @@ def evaluate(config: DictConfig) -> dict[str, Any]:
         FileNotFoundError: if the checkpoint, its configuration or the data is missing.
         ValueError: if an option is wrong or the checkpoint does not fit.
     """
-    with only_process_in(config.output_dir):
-        return _evaluate(config, Path(config.output_dir))
+    folder = Path(config.output_dir)
+    with only_process_in(folder):
+        counts = view_counts(config.views)
+        options: EvaluationOptions = instantiate(config.evaluation, _convert_="all")
+        checkpoint = checkpoint_path(config.ckpt)
+        parts = resolve_parts(config, checkpoint)
+        datamodule: SceneDataModule = instantiate(config.data)
+        data = datamodule.evaluation_data()
+        scenes = list(data.source.scenes)[: datamodule.eval_scenes]
+        samples = {count: options.selection.choose(data.source, scenes, count) for count in counts}
+        refuse_training_views(checkpoint, data.source, [view for views in samples.values() for view in views])
 
+        device = choose_device(config.device)
+        model = build_model(parts, config.seed, device)
+        refuse_without_hints(model, data.source)
+        weights = load_weights(model, checkpoint)
+        lpips, lpips_label = _lpips(options.lpips, device)
+        resolved = OmegaConf.merge(OmegaConf.to_container(config, resolve=True), parts)
+        calibration = find_calibration(model, weights)
+        identity = _identity(resolved, weights, lpips is not None, model, device)
+        if calibration is not None:
+            identity["calibration.sha256"] = calibration.digest
+        store = ResultStore(folder, identity, config.overwrite)
+        write_text(folder / "config.yaml", OmegaConf.to_yaml(resolved, resolve=True))
 
-def _evaluate(config: DictConfig, folder: Path) -> dict[str, Any]:
-    """Runs :func:`evaluate` in a folder that this process has locked."""
-    counts = view_counts(config.views)
-    options: EvaluationOptions = instantiate(config.evaluation, _convert_="all")
-    checkpoint = checkpoint_path(config.ckpt)
-    parts = resolve_parts(config, checkpoint)
-    datamodule: SceneDataModule = instantiate(config.data)
-    data = datamodule.evaluation_data()
-    scenes = list(data.source.scenes)[: datamodule.eval_scenes]
-    samples = {count: options.selection.choose(data.source, scenes, count) for count in counts}
-    refuse_training_views(checkpoint, data.source, [view for views in samples.values() for view in views])
-
-    device = choose_device(config.device)
-    model = build_model(parts, config.seed, device)
-    refuse_without_hints(model, data.source)
-    weights = load_weights(model, checkpoint)
-    lpips, lpips_label = _lpips(options.lpips, device)
-    resolved = OmegaConf.merge(OmegaConf.to_container(config, resolve=True), parts)
-    calibration = find_calibration(model, weights)
-    identity = _identity(resolved, weights, lpips is not None, model, device)
-    if calibration is not None:
-        identity["calibration.sha256"] = calibration.digest
-    store = ResultStore(folder, identity, config.overwrite)
-    write_text(folder / "config.yaml", OmegaConf.to_yaml(resolved, resolve=True))
-
-    refinement = replace(instantiate(config.refine), steps=options.refine, seconds=None) if options.refine else None
-    evaluator = SceneEvaluator(model, instantiate(parts["renderer"]), options, lpips, refinement, calibration)
-    results = {count: _evaluate_all(evaluator, data, views, store, device) for count, views in samples.items()}
-    settings = _settings(config, evaluator, weights, data.source, len(samples[counts[0]]))
-    report = {
-        "settings": settings | {"lpips": lpips_label, "device": str(device)},
-        "views": {
-            str(count): {"mean": mean_metrics(metrics), "scenes": dict(sorted(metrics.items()))}
-            for count, metrics in results.items()
-        },
-    }
-    write_json(folder / "metrics.json", report)
-    text = report_markdown(report)
-    write_text(folder / "metrics.md", text)
-    print(text)
-    if options.pictures:
-        print(f"pictures ({PANELS}): {folder / 'pictures'}")
-    print(f"metrics: {folder / 'metrics.json'}, {folder / 'metrics.md'}")
-    return report
+        refinement = replace(instantiate(config.refine), steps=options.refine, seconds=None) if options.refine else None
+        evaluator = SceneEvaluator(model, instantiate(parts["renderer"]), options, lpips, refinement, calibration)
+        results = {count: _evaluate_all(evaluator, data, views, store, device) for count, views in samples.items()}
+        settings = _settings(config, evaluator, weights, data.source, len(samples[counts[0]]))
+        report = {
+            "settings": settings | {"lpips": lpips_label, "device": str(device)},
+            "views": {
+                str(count): {"mean": mean_metrics(metrics), "scenes": dict(sorted(metrics.items()))}
+                for count, metrics in results.items()
+            },
+        }
+        write_json(folder / "metrics.json", report)
+        text = report_markdown(report)
+        write_text(folder / "metrics.md", text)
+        print(text)
+        if options.pictures:
+            print(f"pictures ({PANELS}): {folder / 'pictures'}")
+        print(f"metrics: {folder / 'metrics.json'}, {folder / 'metrics.md'}")
+        return report
 
 
 def mean_metrics(scenes: Mapping[str, Mapping[str, float | None]]) -> dict[str, float | None]:
@@ -168,7 +172,7 @@ def _evaluate_all(
         metrics = store.read(views)
         if metrics is None or (wanted and not store.picture(views).is_file()):
             batch = data[(views,)].to(device)
-            result = evaluator(batch, has_cameras=data.source.has_cameras)
+            result = evaluator(batch)
             if wanted:
                 protocol = next(name for name in ("gt_pose", "novel", "context") if name in result.renders)
                 truth = batch.context if protocol == "context" else batch.target
@@ -203,3 +207,69 @@ def _settings(
     }
     obstacle = options.table and paper.obstacle(options.table, settings)
     return settings | {"paper": None if obstacle else options.table, "paper_obstacle": obstacle}
+
+
+class ResultStore:
+    """Results of one evaluation, one JSON file per scene.
+
+    Args:
+        folder: the evaluation's folder.
+        identity: flat settings that affect the metrics; an evaluation already in the folder must have the same.
+        overwrite: remove the results that the folder holds, of this or another evaluation.
+
+    Raises:
+        FileExistsError: if the folder holds an evaluation with other settings, or files that do not belong to an
+            evaluation, which are never replaced.
+    """
+
+    def __init__(self, folder: Path, identity: Mapping[str, Any], overwrite: bool = False) -> None:
+        self.folder = folder
+        if not (folder / IDENTITY).is_file():
+            foreign = [name for name in WRITTEN if (folder / name).exists()]
+            if foreign:
+                raise FileExistsError(
+                    f"{folder} holds {', '.join(foreign)}, which do not belong to an evaluation (no {IDENTITY}): "
+                    "choose another output_dir= or name="
+                )
+        elif overwrite:
+            # the report first: an interruption must not leave it next to other settings
+            for name in REPORTS:
+                (folder / name).unlink(missing_ok=True)
+            for name in FOLDERS:
+                shutil.rmtree(folder / name, ignore_errors=True)
+        else:
+            before = read_json(folder / IDENTITY)
+            different = sorted(key for key in before.keys() | identity.keys() if before.get(key) != identity.get(key))
+            if different:
+                told = ", ".join(f"{key} ({before.get(key)} -> {identity.get(key)})" for key in different)
+                raise FileExistsError(
+                    f"{folder} holds an evaluation with other settings: {told}; choose another name=, or replace it "
+                    "with overwrite=true"
+                )
+        write_json(folder / IDENTITY, dict(identity))
+
+    def read(self, views: SceneSample) -> dict[str, float | None] | None:
+        """Stored metrics of a sample; None if it was not evaluated, or with other frames."""
+        path = self._path(views)
+        if not path.is_file():
+            return None
+        stored = read_json(path)
+        same = stored["context"] == list(views.context) and stored["target"] == list(views.target)
+        return stored["scores"] if same else None
+
+    def write(self, views: SceneSample, metrics: Mapping[str, float | None]) -> None:
+        """Writes the metrics of a sample, atomically."""
+        frames = {"context": list(views.context), "target": list(views.target)}
+        write_json(self._path(views), {"scene": views.scene, **frames, "scores": dict(metrics)})
+
+    def picture(self, views: SceneSample) -> Path:
+        """Path of a sample's picture."""
+        return self.folder / "pictures" / f"{file_name(views.scene)}-{len(views.context)}.png"
+
+    def _path(self, views: SceneSample) -> Path:
+        return self.folder / "scenes" / str(len(views.context)) / f"{file_name(views.scene)}.json"
+
+
+def file_name(scene: str) -> str:
+    """Encodes a scene's name as a file name without slashes, unique per scene."""
+    return scene.replace("%", "%25").replace("/", "%2F")

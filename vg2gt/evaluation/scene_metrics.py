@@ -16,10 +16,11 @@ from vg2gt.metrics import (
     point_metrics,
     psnr,
     ssim,
-    stated_error_metrics,
 )
 from vg2gt.types import Batch, Cameras, Decoded, Geometry, Render
-from vg2gt.uncertainty import LEVELS, Calibration, Samples, pixel_evidence
+from vg2gt.uncertainty import LEVELS, Samples, pixel_evidence
+
+SHARES = 20  # steps of the sparsification curve
 
 
 def image_metrics(rendered: Render, truth: Batch, lpips: LPIPS | None = None) -> dict[str, float]:
@@ -87,20 +88,45 @@ def align_geometry(geometry: Geometry, truth: Batch) -> Similarity | None:
     return align_points(predicted[valid][None], reference[valid][None])
 
 
-def stated_metrics(
-    calibration: Calibration, decoded: Decoded, keep: Tensor | None, truth: Batch, predicts_cameras: bool
-) -> dict[str, float]:
-    """Scores the error bounds of one scene's decoded depth (:func:`vg2gt.metrics.stated_error_metrics`).
+def stated_error_metrics(error: Tensor, bounds: Tensor) -> dict[str, float]:
+    """Scores stated bounds on relative errors: how often they hold, how wide they are, and how well they rank errors.
 
     Args:
-        calibration: calibration of the model.
-        decoded: decoded geometry of one scene (B = 1).
-        keep: ``[1, V, H, W]`` bool, pixels that the scene is made of; None: all with a depth.
-        truth: context views of the scene.
-        predicts_cameras: see :func:`pixels_with_errors`.
+        error: ``[N]`` relative errors >= 0.
+        bounds: ``[L, N]`` stated upper bounds of the errors, for each of :data:`vg2gt.uncertainty.LEVELS`.
+
+    Returns:
+        For each level, ``held_90``, the share of errors within the bound, and ``width_90``, the mean bound; and
+        ``ause``, :func:`ause` of the last level's bound. NaN without pixels.
     """
-    pixels = pixels_with_errors(decoded, keep, truth, predicts_cameras)
-    return stated_error_metrics(pixels.error, calibration.bounds(pixels.evidence, pixels.status), LEVELS)
+    scores: dict[str, float] = {}
+    for level, bound in zip(LEVELS, bounds, strict=True):
+        name = f"{100 * level:.0f}"
+        scores[f"held_{name}"] = float((error <= bound).double().mean())
+        scores[f"width_{name}"] = float(bound.double().mean())
+    return scores | {"ause": ause(error, bounds[-1])}
+
+
+def ause(error: Tensor, stated: Tensor) -> float:
+    """Area under the sparsification error (Ilg et al., Uncertainty Estimates for Optical Flow, 2018).
+
+    Removes pixels step by step, once by largest stated and once by largest true error. The area between the two curves
+    of the remaining mean error is given relative to the mean error of all pixels; 0 means a perfect ranking.
+
+    Args:
+        error: ``[N]`` true errors >= 0.
+        stated: ``[N]`` stated errors, which rank the pixels.
+    """
+    if not len(error):
+        return float("nan")
+    left = torch.tensor([max(1, round(len(error) * (1 - step / SHARES))) for step in range(SHARES)])
+
+    def curve(order: Tensor) -> Tensor:
+        """Returns the mean error of the first ``left`` pixels, relative to that of all."""
+        return error[order].double().cumsum(0)[left - 1] / left / mean
+
+    mean = error.double().mean().clamp(min=1e-12)
+    return float((curve(stated.argsort(stable=True)) - curve(error.argsort(stable=True))).mean())
 
 
 def pixels_with_errors(

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from numpy.random import Generator
 from torch import Tensor
 
 from vg2gt.geometry.cameras import compose, rigid_motions
@@ -32,15 +31,11 @@ def with_pose_noise(batch: Batch, share: float) -> Hints:
 
 def _motions(scene: Batch, share: float) -> Tensor:
     """Returns the random motions ``[V, 4, 4]`` of one scene's views."""
-    rng = _rng(scene)
+    name = f"{scene.scene[0]}/{scene.frame_ids[0].tolist()}"
+    rng = np.random.default_rng(int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big"))
     views = scene.images.shape[1]
     amount = rng.uniform(*AMOUNTS) * (rng.random() < share)
     known = scene.depth[scene.depth > 0]
     unit = float(known.median()) if len(known) else 0.0
     turns, shifts = rng.normal(0, TURN * amount, (views, 3)), rng.normal(0, SHIFT * amount * unit, (views, 3))
     return rigid_motions(torch.from_numpy(turns), torch.from_numpy(shifts))
-
-
-def _rng(scene: Batch) -> Generator:
-    name = f"{scene.scene[0]}/{scene.frame_ids[0].tolist()}"
-    return np.random.default_rng(int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big"))

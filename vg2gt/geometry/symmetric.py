@@ -34,7 +34,9 @@ def smallest_eigenvector(matrix: Tensor, fallback: Tensor) -> Tensor:
     centered = a - mean * eye
     radius = (centered.square().sum((-2, -1)) / 6).sqrt()  # [...]
     unit = centered / radius.clamp(min=1e-300)[..., None, None]
-    angle = (_determinant(unit) / 2).clamp(-1, 1).acos() / 3  # in [0, pi / 3]
+    first, second, third = unit.unbind(-2)
+    determinant = (first * torch.linalg.cross(second, third)).sum(-1)
+    angle = (determinant / 2).clamp(-1, 1).acos() / 3  # in [0, pi / 3]
     smallest = mean[..., 0, 0] + 2 * radius * torch.cos(angle + 2 * math.pi / 3)
     rows = (a - smallest[..., None, None] * eye).unbind(-2)
     candidates = torch.stack([torch.linalg.cross(rows[i], rows[j]) for i, j in ((0, 1), (0, 2), (1, 2))], -2)
@@ -61,8 +63,3 @@ def principal_direction(a: Tensor, b: Tensor, c: Tensor) -> tuple[Tensor, Tensor
     angle = 0.5 * torch.atan2(2 * b, a - c)
     largest = 0.5 * (a + c + torch.hypot(a - c, 2 * b))
     return torch.stack((angle.cos(), angle.sin()), -1), largest
-
-
-def _determinant(m: Tensor) -> Tensor:
-    first, second, third = m.unbind(-2)
-    return (first * torch.linalg.cross(second, third)).sum(-1)

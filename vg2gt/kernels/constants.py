@@ -8,6 +8,7 @@ ALPHA_MIN = 1.0 / 255.0  # a Gaussian with a smaller alpha at a pixel is not a h
 TRANSMITTANCE_STOP = 1e-4  # a hit that would bring transmittance below this is dropped, with all hits behind it (3DGS)
 MEDIAN_MAX_TRANSMITTANCE = 0.45  # solid rays with at least this final transmittance have no median depth
 BRACKET_SIGMAS = 4.0  # the median lies within this many standard deviations of the hits' peaks
+NEGLIGIBLE = {4: 30.0, 8: 90.0}  # by bytes of a number: squared sigmas beyond which a profile is 0
 CONVERGED = 4  # relative change of the median, in machine epsilons, at which its search stops
 JACOBIAN_CLAMP = 1.3  # 3DGS clamps the projection's Jacobian at this many half fields of view (rasterized only)
 

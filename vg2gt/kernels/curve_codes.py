@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 
-def _spread_bits(values: Tensor) -> Tensor:
-    """Moves bit i of 21-bit integers to bit 3 i, by doubling the gaps between halves."""
+def z_codes(grid: Tensor) -> Tensor:
+    """Morton codes ``[...]`` of cells ``[..., 3]``, 0 <= coordinate < 2^21; x holds the highest bit of each triple."""
+    # moves bit i of all three axes to bit 3 i, by doubling the gaps between halves
     for shift, mask in (
         (32, 0x1F00000000FFFF),
         (16, 0x1F0000FF0000FF),
@@ -17,13 +18,8 @@ def _spread_bits(values: Tensor) -> Tensor:
         (4, 0x10C30C30C30C30C3),
         (2, 0x1249249249249249),
     ):
-        values = (values | values << shift) & mask
-    return values
-
-
-def z_codes(grid: Tensor) -> Tensor:
-    """Morton codes ``[...]`` of cells ``[..., 3]``, 0 <= coordinate < 2^21; x holds the highest bit of each triple."""
-    x, y, z = _spread_bits(grid).unbind(-1)  # all three axes at once
+        grid = (grid | grid << shift) & mask
+    x, y, z = grid.unbind(-1)
     return x << 2 | y << 1 | z
 
 

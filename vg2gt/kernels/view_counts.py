@@ -3,36 +3,19 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vg2gt.kernels.compiled import kernel
-from vg2gt.kernels.threads import parallel_for
 
 NEAREST = 1e-6  # smallest depth in another camera, in scene units
 HEAVIEST = 2.0  # largest weight of a view that is nearer to the point than the pixel's own
 
 
-def count_compiled(
-    depth: NDArray[np.float32],
-    partners: NDArray[np.int64],
-    matrix: NDArray[np.float32],
-    tolerance: float,
-    margin: float,
-    weighted: bool,
-) -> list[NDArray[np.float32]]:
-    """Counts views that agree, look through and are hidden, ``[V, H, W]`` each; ``matrix``: see :func:`_count_view`.
+@kernel(fastmath={"contract", "nsz", "arcp"}, error_model="numpy", nogil=True)
+def count_view(view, depth, partners, matrix, tolerance, margin, weighted, agree, through, hidden):
+    """Counts for one view's pixels; ``matrix`` ``[V, K, 3, 4]`` maps ``depth * (x, y, 1)`` to a partner's image.
 
     ``weighted`` counts a view by the pixel's depth over the point's depth in that view, at most :data:`HEAVIEST`.
     """
-    sums = [np.zeros(depth.shape, np.float32) for _ in range(3)]
-    limits = np.float32(tolerance), np.float32(margin)
-    parallel_for(range(len(depth)), lambda view: _count_view(view, depth, partners, matrix, *limits, weighted, *sums))
-    return sums
-
-
-@kernel(fastmath={"contract", "nsz", "arcp"}, error_model="numpy", nogil=True)
-def _count_view(view, depth, partners, matrix, tolerance, margin, weighted, agree, through, hidden):
-    """Counts for one view's pixels; ``matrix`` ``[V, K, 3, 4]`` maps ``depth * (x, y, 1)`` to a partner's image."""
     height, width = depth.shape[1:]
     one, half = np.float32(1), np.float32(0.5)
     most = one - margin

@@ -2,41 +2,21 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
-import torch
-from torch import Tensor
 
 from vg2gt.kernels.compiled import kernel
 from vg2gt.kernels.compiled_math import exp
-from vg2gt.kernels.threads import over_voxels
 
 I1 = np.uintp(1)  # unsigned: no negative indices
 
 
-def spread_around(
-    keys: Tensor, columns: Tensor, counts: Tensor, spread: Tensor, normal: Tensor, offset: Tensor, same_surface: float
-) -> Tensor:
-    """Returns covariances ``[M, 3, 3]`` of the points in every voxel and its 26 neighbours; see the method's reference.
-
-    ``keys`` ``[M]`` are the cells' keys, ascending. ``columns`` ``[9]`` are the offsets from a cell's key to those of
-    the first cells of the nine columns around it.
-    """
-    above = keys.new_full((1,), torch.iinfo(keys.dtype).max)  # a sentinel that ends the scan of the keys
-    around = torch.empty_like(spread, memory_format=torch.contiguous_format)
-    inputs = (torch.cat((keys, above)), columns, counts, spread, normal, offset, around)
-    arrays = [values.detach().contiguous().numpy() for values in inputs]
-    sharpness = np.float32(math.sqrt(0.5) / same_surface)
-    over_voxels(len(keys), lambda first, last: _spread_around(*arrays, np.empty(9, np.uintp), sharpness, first, last))
-    return around
-
-
 @kernel(fastmath={"contract", "nsz", "arcp"}, error_model="numpy", nogil=True)
-def _spread_around(keys, columns, counts, spread, normal, offset, around, starts, sharpness, first, last):
-    """:func:`spread_around` of voxels ``first .. last - 1``; ``keys`` ``[M + 1]`` end with a sentinel.
+def spread_around(keys, columns, counts, spread, normal, offset, around, starts, sharpness, first, last):
+    """Writes covariances ``[M, 3, 3]`` of the points in voxels ``first .. last - 1`` and their 26 neighbours.
 
-    The cells of a column have consecutive keys. As the voxels' keys ascend, so do those of each column.
+    ``keys`` ``[M + 1]`` are the cells' keys, ascending, and a sentinel. ``columns`` ``[9]`` are the offsets from a
+    cell's key to those of the first cells of the nine columns around it; ``starts`` ``[9]`` is scratch memory. The
+    cells of a column have consecutive keys. As the voxels' keys ascend, so do those of each column.
     """
     one = np.float32(1)
     for column in range(9):

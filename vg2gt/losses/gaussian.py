@@ -10,9 +10,8 @@ from torch import Tensor
 
 from vg2gt.geometry.normals import normals_from_depth
 from vg2gt.kernels.structure import HALF, WINDOW, Structure
-from vg2gt.types import Cameras, Render, TensorRecord
-
-NORMAL_TARGETS = ("render", "decoded", "gt")
+from vg2gt.kernels.threads import compilable
+from vg2gt.types import Cameras, Render, TensorRecord, check_choice
 
 
 @dataclass(frozen=True)
@@ -40,10 +39,6 @@ class RenderTargets(TensorRecord):
     decoded_valid: Tensor
     comparable: Tensor
     mask: Tensor | None = None
-
-    def scene(self, index: int) -> RenderTargets:
-        """Returns the targets of one of B scenes."""
-        return self.map(lambda tensor: tensor[index])
 
 
 @dataclass(frozen=True)
@@ -79,8 +74,7 @@ class GaussianLoss:
     min_alpha: float = 0.5
 
     def __post_init__(self) -> None:
-        if self.normal_target not in NORMAL_TARGETS:
-            raise ValueError(f"loss.gaussian.normal_target must be one of {NORMAL_TARGETS}, got {self.normal_target!r}")
+        check_choice("loss.gaussian.normal_target", self.normal_target, ("render", "decoded", "gt"))
 
     def hits(self, rendered: Render) -> Tensor:
         """Returns ``[B, R, H, W]`` bool: which pixels show a surface."""
@@ -155,8 +149,7 @@ def structure_loss(images: Tensor, reference: Tensor) -> Tensor:
     Returns:
         A scalar, differentiable in the images. Compiled if both are float32 on a CPU and the reference has no gradient.
     """
-    on_cpu = all(tensor.device.type == "cpu" and tensor.dtype == torch.float32 for tensor in (images, reference))
-    if on_cpu and not reference.requires_grad and min(images.shape[-2:]) > HALF:
+    if compilable(images, reference) and not reference.requires_grad and min(images.shape[-2:]) > HALF:
         return Structure.apply(images, reference)  # pyright: ignore[reportReturnType]
     return structure_reference(images, reference)
 

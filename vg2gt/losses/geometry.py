@@ -13,7 +13,6 @@ from torch import Tensor
 
 from vg2gt.geometry.cameras import invert_rigid
 from vg2gt.geometry.normals import ray_slopes
-from vg2gt.geometry.rotations import matrix_to_quat
 from vg2gt.kernels.point_normals import PointNormals
 from vg2gt.losses.truth import Truth
 from vg2gt.types import Cameras
@@ -213,32 +212,3 @@ def _corner_normals(depth: Tensor, intrinsics: Tensor, stride: int) -> Tensor:
 def _turn(cameras: Cameras, truth: Truth) -> Tensor:
     """Returns rotations ``[V, 3, 3]`` from the true cameras' frames to the predicted ones'."""
     return cameras.world_to_camera[0, :, :3, :3] @ truth.cameras.world_to_camera[0, :, :3, :3].transpose(-1, -2)
-
-
-@torch.no_grad()
-def camera_errors(cameras: Cameras, truth: Cameras) -> dict[str, Tensor]:
-    """Returns mean absolute errors of translation, quaternion and field of view (VGGT's pose encoding), for logging.
-
-    Args:
-        cameras: predicted cameras in the frame of view 0, translations in the truth's unit.
-        truth: ground truth of the same views.
-
-    Returns:
-        Scalars ``camera_T``, ``camera_R`` (with the closer quaternion sign) and ``camera_F`` (radians).
-    """
-    translation = (cameras.world_to_camera[..., :3, 3] - truth.world_to_camera[..., :3, 3]).abs()
-    quats, true_quats = (matrix_to_quat(c.world_to_camera[..., :3, :3]) for c in (cameras, truth))
-    sign = torch.where((quats * true_quats).sum(-1, keepdim=True) < 0, -1.0, 1.0)
-    fields = [_field_of_view(c) for c in (cameras, truth)]
-    return {
-        "camera_T": translation.clamp(max=MAX_ERROR).mean(),
-        "camera_R": (quats * sign - true_quats).abs().mean(),
-        "camera_F": (fields[0] - fields[1]).abs().mean(),
-    }
-
-
-def _field_of_view(cameras: Cameras) -> Tensor:
-    """Returns the vertical and horizontal field of view ``[B, V, 2]`` in radians."""
-    height, width = cameras.size
-    fx, fy = cameras.intrinsics[..., 0, 0], cameras.intrinsics[..., 1, 1]
-    return 2 * torch.stack((torch.atan(height / (2 * fy)), torch.atan(width / (2 * fx))), -1)

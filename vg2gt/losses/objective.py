@@ -10,13 +10,11 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from vg2gt.losses.gaussian import GaussianLoss, RenderTargets
-from vg2gt.losses.geometry import GeometryLoss, TaskLoss, camera_errors
+from vg2gt.losses.geometry import GeometryLoss, TaskLoss
 from vg2gt.losses.truth import ScaleAlignment, Truth, fit_scale, normalize_truth, to_unit
-from vg2gt.types import Batch, Cameras, Decoded, Geometry, Render, TensorRecord
+from vg2gt.types import Batch, Cameras, Decoded, Geometry, Render, TensorRecord, check_choice
 
 Record = TypeVar("Record", bound=TensorRecord)
-FORMS = ("improve", "paper_literal")
-COMPARED = ("total", "reg")
 
 
 @dataclass(frozen=True)
@@ -41,10 +39,8 @@ class EnhancementLoss:
     on: str = "total"
 
     def __post_init__(self) -> None:
-        if self.form not in FORMS:
-            raise ValueError(f"loss.enhance.form must be one of {FORMS}, got {self.form!r}")
-        if self.on not in COMPARED:
-            raise ValueError(f"loss.enhance.on must be one of {COMPARED}, got {self.on!r}")
+        check_choice("loss.enhance.form", self.form, ("improve", "paper_literal"))
+        check_choice("loss.enhance.on", self.on, ("total", "reg"))
 
     def __call__(self, before: TaskLoss, after: TaskLoss) -> Tensor:
         """Returns the unweighted hinge, a scalar with gradient for ``after`` only."""
@@ -159,7 +155,8 @@ class VG2GTLoss(nn.Module):
                 targets = _render_targets(batch, after, truth, views)
                 for i, (total, terms) in enumerate(scenes):
                     shown = _one(rendered, i)
-                    found = self.gaussian(shown, cameras.scene(i), targets.scene(i), scale[i])
+                    own = targets.map(lambda tensor, i=i: tensor[i])
+                    found = self.gaussian(shown, cameras.scene(i), own, scale[i])
                     share = self.gaussian.hits(shown).to(scale.dtype).mean()
                     scenes[i] = (total + self.gaussian.total(found), terms | found | {"rendered": share})
             # means over scenes
@@ -181,7 +178,6 @@ class VG2GTLoss(nn.Module):
         terms |= {"enhance_depth": hinge_depth, "enhance_point": hinge_point}
         terms |= {"initial_depth": self.enhance.compared(depth_before)}
         terms |= {"initial_point": self.enhance.compared(point_before)}
-        terms |= camera_errors(after.cameras, truth.cameras)
         return total + self.enhance.weight * (hinge_depth + hinge_point), terms
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from vg2gt.geometry.alignment import fit_depth_scale
 from vg2gt.geometry.cameras import relative_to_first, scale_translations
 from vg2gt.geometry.normals import ray_slopes
-from vg2gt.types import Batch, Cameras, Geometry, TensorRecord
+from vg2gt.types import Batch, Cameras, Geometry, TensorRecord, check_choice
 
 MIN_PIXELS = 100
 
@@ -64,9 +64,6 @@ def _distance_from_first(depth: Tensor, cameras: Cameras) -> Tensor:
     return ((depth * u - x).square() + (depth * v - y).square() + (depth - z).square()).sqrt()
 
 
-SCALE_SOURCES = ("initial", "enhanced", "rendered")
-
-
 @dataclass(frozen=True)
 class ScaleAlignment:
     """Fits the scale that converts a prediction to the ground truth's unit before the losses compare them.
@@ -83,8 +80,7 @@ class ScaleAlignment:
     source: str = "enhanced"
 
     def __post_init__(self) -> None:
-        if self.source not in SCALE_SOURCES:
-            raise ValueError(f"loss.align.source must be one of {SCALE_SOURCES}, got {self.source!r}")
+        check_choice("loss.align.source", self.source, ("initial", "enhanced", "rendered"))
 
 
 def fit_scale(depth: Tensor, truth: Truth, valid: Tensor, fallback: Tensor | float = 1.0) -> Tensor:

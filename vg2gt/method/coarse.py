@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Literal, get_args
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -17,6 +17,8 @@ from vg2gt.method.additions.surface_evidence import (
     SURFACE_CHANNELS,
     PointFrames,
     cell_centroids,
+    disagreement,
+    gate,
     vectors_to_surface,
     voxel_evidence,
 )
@@ -28,11 +30,10 @@ from vg2gt.method.grid import (
     pool_mean,
     pool_min,
     scene_voxel_size,
-    warn_if_sparse,
 )
 from vg2gt.method.knn import interpolate, interpolation_weights
 from vg2gt.method.ptv3 import PTv3
-from vg2gt.types import Cameras, Geometry, Tokens
+from vg2gt.types import Cameras, Geometry, Tokens, check_choice
 
 Inject = Literal["last", "all"]
 
@@ -84,8 +85,7 @@ class CoarseModule(nn.Module):
         gate: bool = False,
     ) -> None:
         super().__init__()
-        if inject not in get_args(Inject):
-            raise ValueError(f"coarse.inject is {inject!r}; choose one of {', '.join(get_args(Inject))}")
+        check_choice("coarse.inject", inject, Inject)
         if fuse_kernel not in (1, 3):
             raise ValueError(f"coarse.fuse_kernel is {fuse_kernel!r}; choose 1 or 3")
         if gate and not surface_evidence:
@@ -166,8 +166,6 @@ class CoarseModule(nn.Module):
         """Pools to voxels, runs PTv3, interpolates at the points: features ``[N, C]`` and gate ``[B, 1, 1, 1]``."""
         with full_precision(embedded):
             plan = plan_voxels(points.cells, points.batch, torch.ones_like(points.batch, dtype=torch.bool))
-            if points.views > 1:
-                warn_if_sparse(plan, len(points.voxel_size), "coarse")
             pooled = pool_mean(embedded, points.confidence, plan)  # f_m^v, eqn voxelfeature: [M, C]
             least = pool_min(points.confidence, plan)  # n_m^v, eqn voxelfeature: [M]
             centroid = cell_centroids(points.cells, points.confidence, plan) if self.surface_evidence else None
@@ -196,7 +194,10 @@ class CoarseModule(nn.Module):
             evidence = torch.where(weights > 0, voxel_evidence(points.confidence, plan)[index], 0)
             to_surface = vectors_to_surface(queries, centers + centroid, evidence, index)
             frames = PointFrames(points.depth, points.cameras, points.rows)
-            seen, gain = frames.evidence(to_surface, points.voxel_size, points.batch, points.clear)
+            seen = frames.in_camera(to_surface, points.voxel_size[points.batch])
+            if points.clear is not None:  # nothing is known near silhouettes
+                seen = torch.where(points.clear[:, None], seen, 0)
+                gain = gate(disagreement(seen[:, -1], points.clear, points.batch, len(gain)))
             enhanced = torch.cat((enhanced, seen, points.confidence.log()[:, None]), -1)
         return enhanced, gain[:, None, None, None]
 
@@ -243,7 +244,6 @@ class PatchPoints:
         smallest = -F.max_pool2d(-confidence, cell)  # [B, V, h, w]
         valid = torch.isfinite(sampled) & (sampled > 0) & torch.isfinite(smallest) & (smallest > 0)
         self.voxel_size = voxel_size
-        self.views = sampled.shape[1]
         self.depth = torch.where(valid, sampled, 0.0)
         self.cameras = _sampled_cameras(geometry.cameras, cell, (sampled.shape[-2], sampled.shape[-1]))
         points = unproject(torch.where(valid, sampled, 1.0), self.cameras)  # [B, V, h, w, 3]

@@ -29,23 +29,22 @@ class Reassemble(nn.Module):
 
     Args:
         token_dim: token width.
-        tap_channels: width after the projection.
         channels: width of the feature map.
         factor: resolution relative to the patch grid: 4, 2, 1 or 0.5.
     """
 
-    def __init__(self, token_dim: int, tap_channels: int, channels: int, factor: float) -> None:
+    def __init__(self, token_dim: int, channels: int, factor: float) -> None:
         super().__init__()
         self.norm = nn.LayerNorm(token_dim)
-        self.project = nn.Linear(token_dim, tap_channels)
+        self.project = nn.Linear(token_dim, channels)
         if factor > 1:
             size = int(factor)
-            self.resize: nn.Module = nn.ConvTranspose2d(tap_channels, tap_channels, size, stride=size)
+            self.resize: nn.Module = nn.ConvTranspose2d(channels, channels, size, stride=size)
         elif factor == 1:
             self.resize = nn.Identity()
         else:
-            self.resize = nn.Conv2d(tap_channels, tap_channels, 3, stride=2, padding=1)
-        self.smooth = nn.Conv2d(tap_channels, channels, 3, padding=1, bias=False)
+            self.resize = nn.Conv2d(channels, channels, 3, stride=2, padding=1)
+        self.smooth = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
 
     def forward(self, tokens: Tensor, grid: tuple[int, int]) -> Tensor:
         """Maps ``[N, P, D]`` tokens on a ``(rows, columns)`` grid to ``[N, C, factor * rows, factor * columns]``."""
@@ -66,7 +65,6 @@ class DenseHead(nn.Module):
         features: width of the pyramid.
         out_channels: width of the result.
         merge_channels: width at full resolution before the last convolution; None uses ``out_channels``.
-        tap_channels: width of every tap before fusion; None uses ``features`` for all.
         finest: resolution of the shallowest tap relative to the patch grid: 4, 2 or 1. Each next tap has half of it,
             down to 0.5.
         views_per_chunk: views decoded at a time; bounds the peak memory at inference.
@@ -79,16 +77,10 @@ class DenseHead(nn.Module):
         features: int = 256,
         out_channels: int = 128,
         merge_channels: int | None = None,
-        tap_channels: Sequence[int] | None = None,
         finest: int = 4,
         views_per_chunk: int = 8,
     ) -> None:
         super().__init__()
-        widths = [features] * len(token_dims) if tap_channels is None else list(tap_channels)
-        if len(widths) != len(token_dims):
-            raise ValueError(
-                f"dense_head.tap_channels has {len(widths)} entries, but the backend taps {len(token_dims)} layers"
-            )
         if finest not in (1, 2, 4):
             raise ValueError(f"dense_head.finest must be 1, 2 or 4, got {finest}")
         factors = [max(finest / 2**i, 0.5) for i in range(len(token_dims))]
@@ -96,8 +88,7 @@ class DenseHead(nn.Module):
         self.out_channels = out_channels
         self.views_per_chunk = views_per_chunk
         self.reassemble = nn.ModuleList(
-            Reassemble(dim, width, features, factor)
-            for dim, width, factor in zip(token_dims, widths, factors, strict=True)
+            Reassemble(dim, features, factor) for dim, factor in zip(token_dims, factors, strict=True)
         )
         self.refine_skip = nn.ModuleList(ResidualConvUnit(features) for _ in token_dims[1:])
         self.refine = nn.ModuleList(ResidualConvUnit(features) for _ in token_dims)

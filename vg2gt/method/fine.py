@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -30,7 +30,6 @@ from vg2gt.method.grid import (
     pool_min,
     scene_counts,
     scene_voxel_size,
-    warn_if_sparse,
 )
 from vg2gt.method.point_mlp import PointMLP
 from vg2gt.method.pooled import MOMENTS, PooledVoxels
@@ -175,8 +174,6 @@ class FineModule(nn.Module):
             if capped and self.cap.limit is not None:
                 keep = self.cap(pool_min(points.confidence.detach(), plan), plan.batch)
                 plan = plan if keep is None else plan.select(keep)
-            if images.shape[1] > 1:
-                warn_if_sparse(plan, len(size), "fine")
         # dense features to voxels: [M, C]
         pooled = self._pool_features(tokens, images, points, plan)
         # position, colour, confidence and second moments of the points in every voxel
@@ -228,13 +225,18 @@ class FineModule(nn.Module):
 
     def _pool_features(self, tokens: Tokens, images: Tensor, points: _Points, plan: VoxelPlan) -> Tensor:
         """Pools dense features to ``[M, C]``; without gradient, a few views at a time, which bounds the memory."""
-        others = (points.offset, self.point_offset.weight, points.confidence, plan)
-        with_gradient = torch.is_grad_enabled() or not len(plan)
-        maps = [self.dense_head(tokens, images)] if with_gradient else self.dense_head.chunks(tokens, images)
-        chunks = map(_pixel_rows, maps)
-        if with_gradient:
-            return pool_point_features(next(chunks), *others)
-        return pool_point_features_of_chunks(chunks, *others)
+        weight = self.point_offset.weight
+        if torch.is_grad_enabled() or not len(plan):
+            dense = _pixel_rows(self.dense_head(tokens, images))
+            return pool_point_features(dense, points.offset, weight, points.confidence, plan)
+        offsets = points.offset.split(self.dense_head.views_per_chunk * images[0, 0, 0].numel())
+        # not a generator, which would hold a chunk while the next is computed
+        chunks = map(
+            lambda dense, offset: point_features(_pixel_rows(dense), offset, weight),
+            self.dense_head.chunks(tokens, images),
+            offsets,
+        )
+        return pool_mean_of_chunks(chunks, points.confidence, plan)
 
 
 class _Measured(NamedTuple):
@@ -298,21 +300,6 @@ def pool_point_features(dense: Tensor, offset: Tensor, weight: Tensor, confidenc
         places = (plan.order, plan.starts, plan.counts, plan.voxel_of)
         return PooledFeatures.apply(dense, offset, weight, confidence, *places)  # pyright: ignore[reportReturnType]
     return pool_mean(point_features(dense, offset, weight), confidence, plan)
-
-
-@torch.no_grad()
-def pool_point_features_of_chunks(
-    chunks: Iterable[Tensor], offset: Tensor, weight: Tensor, confidence: Tensor, plan: VoxelPlan
-) -> Tensor:
-    """Computes :func:`pool_point_features` without gradient from consecutive chunks ``[n, C]`` of dense features."""
-    begin = 0
-
-    def features(dense: Tensor) -> Tensor:  # not a generator, which would hold a chunk while the next is computed
-        nonlocal begin
-        begin += len(dense)
-        return point_features(dense, offset[begin - len(dense) : begin], weight)
-
-    return pool_mean_of_chunks(map(features, chunks), confidence, plan)
 
 
 def point_features(dense: Tensor, offset: Tensor, weight: Tensor) -> Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Literal, get_args
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -14,7 +14,7 @@ from vg2gt.geometry.rotations import matrix_to_quat, multiply_quats
 from vg2gt.geometry.spherical_harmonics import MAX_DEGREE, rgb_to_sh
 from vg2gt.memory import Cap, note_sizes
 from vg2gt.method.additions.surfel import SurfelStart, surfel_start
-from vg2gt.types import Gaussians, Voxels
+from vg2gt.types import Gaussians, Voxels, check_choice
 
 Anchor = Literal["centroid", "center"]
 Start = Literal["plain", "surfel"]
@@ -59,10 +59,8 @@ class GaussianHead(nn.Module):
             raise ValueError(f"gaussians.splits must be at least 1, got {splits}")
         if not 0 <= sh_degree <= MAX_DEGREE:
             raise ValueError(f"gaussians.sh_degree must be 0 to {MAX_DEGREE}, got {sh_degree}")
-        if anchor not in get_args(Anchor):
-            raise ValueError(f"gaussians.anchor is {anchor!r}; choose one of {', '.join(get_args(Anchor))}")
-        if start not in get_args(Start):
-            raise ValueError(f"gaussians.start is {start!r}; choose one of {', '.join(get_args(Start))}")
+        check_choice("gaussians.anchor", anchor, Anchor)
+        check_choice("gaussians.start", start, Start)
         self.splits = splits
         self.start: Start = start
         self.sh_degree = sh_degree
@@ -77,11 +75,10 @@ class GaussianHead(nn.Module):
         nn.init.normal_(self.out.weight, std=0.02)
         nn.init.zeros_(self.out.bias)
         plain = 1 - (1 - INITIAL_ALPHA) ** (1 / splits)
-        self.opacity_bias = _logit(plain if start == "plain" else SURFEL_ALPHA)
-        degrees = [degree for degree in range(sh_degree + 1) for _ in range(2 * degree + 1)]
-        gains = torch.tensor([0.1 * 0.25**degree if degree else 1.0 for degree in degrees])
+        alpha = plain if start == "plain" else SURFEL_ALPHA
+        self.opacity_bias = math.log(alpha / (1 - alpha))
         self.sh_gain: Tensor
-        self.register_buffer("sh_gain", gains[:, None], persistent=False)
+        self.register_buffer("sh_gain", harmonic_gains(sh_degree), persistent=False)
 
     def forward(self, voxels: Voxels) -> Gaussians:
         """Splits every voxel.
@@ -134,5 +131,7 @@ class GaussianHead(nn.Module):
         return replace(start, offsets=start.offsets + shift[:, None])
 
 
-def _logit(probability: float) -> float:
-    return math.log(probability / (1 - probability))
+def harmonic_gains(degree: int) -> Tensor:
+    """Returns factors ``[(degree + 1)^2, 1]`` that make predicted SH coefficients of higher degrees start small."""
+    degrees = [each for each in range(degree + 1) for _ in range(2 * each + 1)]
+    return torch.tensor([0.1 * 0.25**each if each else 1.0 for each in degrees])[:, None]

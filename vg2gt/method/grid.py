@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,14 +13,7 @@ from torch.nn import functional as F
 from vg2gt.geometry.cameras import focal_lengths
 from vg2gt.types import Geometry
 
-log = logging.getLogger(__name__)
-
 MAX_CELLS = 1 << 18  # cells on either side of the origin: 19 bits per axis leave 6 of a code's 63 for the scene
-# Below these values, hardly any voxel fuses several views. The coarse level has only a few points per patch, and its
-# voxels also share features through PTv3 and the interpolation over 16 neighbours.
-MIN_POINTS_PER_VOXEL = {"coarse": 1.1, "fine": 1.2}
-
-_warned_of_sparse: set[str] = set()
 
 
 @dataclass(frozen=True)
@@ -150,28 +142,6 @@ def plan_voxels(cells: Tensor, batch: Tensor, valid: Tensor) -> VoxelPlan:
     voxel_of = torch.full_like(batch, -1)
     voxel_of[point_rows] = inverse
     return VoxelPlan(floors[first], scenes[first], point_rows, starts, counts, voxel_of)
-
-
-def warn_if_sparse(plan: VoxelPlan, scenes: int, module: str) -> None:
-    """Logs a warning, once per module and process, if a scene's voxels have hardly more than one point each.
-
-    Args:
-        plan: the voxels of B scenes.
-        scenes: B.
-        module: module whose options are named, ``coarse`` or ``fine``.
-    """
-    if module in _warned_of_sparse or not len(plan):
-        return
-    voxels = scene_counts(plan.batch, scenes)
-    points = torch.zeros_like(voxels).index_add_(0, plan.batch, plan.counts)
-    fewest = float(torch.where(voxels > 0, points / voxels, torch.inf).min())
-    if fewest < MIN_POINTS_PER_VOXEL[module]:
-        _warned_of_sparse.add(module)
-        log.warning(
-            "the %s voxels of a scene contain only %.2f points each, so views are hardly fused. If the views overlap, "
-            "increase model.%s.voxel_size or model.%s.min_footprint (pixels per edge at the median depth)",
-            *(module, fewest, module, module),
-        )
 
 
 class _WeightedMean(torch.autograd.Function):

@@ -22,23 +22,6 @@ SHIFT = 0.37  # offset of the second curve, in extents: the two curves rarely ju
 SLACK = 1e-9  # relative margin for the rounding of distances
 
 
-def nearest_neighbors(queries: Tensor, points: Tensor, neighbors: int) -> Tensor:
-    """Returns the indices of the nearest points, nearest first; exact.
-
-    Args:
-        queries: ``[N, 3]``.
-        points: ``[M, 3]``, M >= 1.
-        neighbors: number of neighbours; at most M are returned.
-
-    Returns:
-        ``[N, min(neighbors, M)]`` int64.
-    """
-    batches = (torch.zeros(len(rows), dtype=torch.int64, device=rows.device) for rows in (queries, points))
-    query_batch, point_batch = batches
-    count = min(neighbors, len(points))
-    return nearest_in_scenes(queries, query_batch, points, point_batch, count, 1)[0]
-
-
 def nearest_in_scenes(
     queries: Tensor, query_batch: Tensor, points: Tensor, point_batch: Tensor, neighbors: int, scenes: int
 ) -> tuple[Tensor, Tensor]:
@@ -141,23 +124,12 @@ class _Curve:
 def nearest_by_cells(
     queries: Tensor, query_batch: Tensor, points: Tensor, point_batch: Tensor, neighbors: int, scenes: int
 ) -> tuple[Tensor, Tensor]:
-    """Returns the k nearest points in each query's own scene, nearest first; ties (in float64) are broken arbitrarily.
+    """:func:`nearest_in_scenes` by sorted cells; ties (in float64) are broken arbitrarily.
 
     Points are sorted along a Morton curve, on which a cell of any size is a contiguous range. The points next to a
     query on the curve bound the distance to its k-th neighbour. The neighbours lie in the cells that the ball of that
     radius meets: at most 27 cells of a matching size. Work is linear in the points, with few host-device
     synchronisations.
-
-    Args:
-        queries: ``[N, 3]`` query points.
-        query_batch: ``[N]`` scene index.
-        points: ``[M, 3]`` points to search, M >= 1.
-        point_batch: ``[M]`` scene index, sorted.
-        neighbors: number of neighbours k.
-        scenes: number of scenes.
-
-    Returns:
-        Rows of ``points`` ``[N, k]`` int64, and ``[N, k]`` bool that is False (row 0) where the scene has fewer points.
     """
     low = points.amin(0).double()
     extent = (points.amax(0).double() - low).amax().clamp(min=torch.finfo(torch.float32).tiny)

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from typing import Literal, get_args
+from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -15,10 +16,12 @@ from torch.nn import functional as F
 
 from vg2gt.method.serialization import ORDERS, Windows, make_windows, relative_grid, serial_keys
 from vg2gt.method.sparse_conv import Cells, NeighborTable, Pairs, SubmanifoldConv3d, neighbors
+from vg2gt.types import check_choice
 
-Norm = Literal["layer", "group", "batch"]
+Norm = Literal["layer", "batch"]
 
 
+@dataclass(eq=False)
 class Level:
     """Voxels of one resolution without features: their curves, windows and neighbours, each computed once.
 
@@ -32,24 +35,18 @@ class Level:
         order: ``[M]`` voxels sorted by parent; None if they are already sorted.
     """
 
-    def __init__(
-        self,
-        grid: Tensor,
-        batch: Tensor,
-        counts: list[int],
-        keys: list[Tensor],
-        generator: torch.Generator | None,
-        parent_of: Tensor,
-        order: Tensor | None = None,
-    ) -> None:
-        self.grid = grid
-        self.batch = batch
-        self.keys = keys
-        self.counts = counts
-        self.parent_of = parent_of
-        self.order = order
-        count = len(keys)
-        self.sequence = torch.randperm(count, generator=generator).tolist() if generator else list(range(count))
+    grid: Tensor
+    batch: Tensor
+    counts: list[int]
+    keys: list[Tensor]
+    generator: torch.Generator | None
+    parent_of: Tensor
+    order: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        count = len(self.keys)
+        drawn = torch.randperm(count, generator=self.generator).tolist() if self.generator else list(range(count))
+        self.sequence: list[int] = drawn
         self._windows: dict[tuple[int, int], Windows] = {}
         self.pairs: dict[int, Pairs | NeighborTable] = {}
 
@@ -369,8 +366,5 @@ def _ramp(largest: float, depths: Sequence[int]) -> list[list[float]]:
 
 
 def _make_norm(kind: Norm, channels: int) -> nn.Module:
-    if kind not in get_args(Norm):
-        raise ValueError(f"ptv3.norm is {kind!r}; choose one of {', '.join(get_args(Norm))}")
-    if kind == "batch":
-        return nn.BatchNorm1d(channels, eps=1e-3, momentum=0.01)
-    return nn.GroupNorm(32, channels, eps=1e-3) if kind == "group" else nn.LayerNorm(channels)
+    check_choice("ptv3.norm", kind, Norm)
+    return nn.BatchNorm1d(channels, eps=1e-3, momentum=0.01) if kind == "batch" else nn.LayerNorm(channels)

@@ -4,12 +4,10 @@ from vg2gt.metrics.cameras import camera_metrics, relative_pose_errors
 from vg2gt.metrics.depth import depth_metrics, near_depth_edges, normal_metrics
 from vg2gt.metrics.images import LPIPS, WeightsNotFoundError, load_lpips, psnr, ssim
 from vg2gt.metrics.points import cv, point_metrics
-from vg2gt.metrics.stated import ause, stated_error_metrics
 
 __all__ = [
     "LPIPS",
     "WeightsNotFoundError",
-    "ause",
     "camera_metrics",
     "cv",
     "depth_metrics",
@@ -20,5 +18,4 @@ __all__ = [
     "psnr",
     "relative_pose_errors",
     "ssim",
-    "stated_error_metrics",
 ]

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from vg2gt.geometry.alignment import MIN_DEPTH, weighted_median
+from vg2gt.types import check_choice
 
 ALIGNMENTS = ("median", "scene", "wmed", "scale_shift", "none")
 DELTAS = (1.25, 1.05, 1.03)
@@ -42,8 +43,7 @@ def depth_metrics(
     Raises:
         ValueError: if the alignment is unknown.
     """
-    if alignment not in ALIGNMENTS:
-        raise ValueError(f"alignment must be one of {ALIGNMENTS}, got {alignment!r}")
+    check_choice("evaluation.alignment", alignment, ALIGNMENTS)
     predicted, reference = predicted.double(), reference.double()
     usable = (reference > 0) & reference.isfinite()
     valid = usable & (predicted > 0) & predicted.isfinite()
@@ -53,16 +53,16 @@ def depth_metrics(
             predicted = predicted * (reference[valid] / predicted[valid]).median()
     region = torch.ones_like(usable) if region is None else region
     images = [
-        _score(align_depth(p[v], r[v], alignment)[s[v]], r[v & s], (v & s).sum().double() / (u & s).sum())
+        _score(_aligned(p[v], r[v], alignment)[s[v]], r[v & s], (v & s).sum().double() / (u & s).sum())
         for p, r, u, v, s in zip(predicted, reference, usable, valid, region, strict=True)
         if (u & s).any()
     ]
     return {name: float(torch.stack([i[name] for i in images]).nanmean()) if images else math.nan for name in NAMES}
 
 
-def align_depth(predicted: Tensor, reference: Tensor, alignment: str) -> Tensor:
+def _aligned(predicted: Tensor, reference: Tensor, alignment: str) -> Tensor:
     """Aligns the depths ``[N]`` of one image to their references ``[N]``; see :func:`depth_metrics`."""
-    if alignment == "none" or predicted.numel() == 0:
+    if alignment in ("none", "scene") or not len(predicted):
         return predicted
     if alignment == "median":
         return predicted * (reference / predicted).median()
@@ -109,13 +109,12 @@ def normal_metrics(predicted: Tensor, reference: Tensor, valid: Tensor) -> dict[
     cosine = dot / torch.where(valid, lengths, 1.0)
     # atan2 keeps its precision at small angles, where acos has none.
     angle = torch.atan2(torch.linalg.cross(predicted, reference, dim=1).norm(dim=1), dot).rad2deg()
-    images = [_score_normals(a[v], c[v]) for a, c, v in zip(angle, cosine, valid, strict=True) if v.any()]
-    return {name: float(torch.stack([i[name] for i in images]).mean()) if images else math.nan for name in NORMAL_NAMES}
-
-
-def _score_normals(angle: Tensor, cosine: Tensor) -> dict[str, Tensor]:
-    results = {"mean": angle.mean(), "median": angle.median(), "cosine": cosine.mean()}
-    return results | {f"acc_{a}": (angle < a).double().mean() for a in NORMAL_ACCURACIES}
+    images = []
+    for a, c in ((a[v], c[v]) for a, c, v in zip(angle, cosine, valid, strict=True) if v.any()):
+        shares = [(a < limit).double().mean() for limit in NORMAL_ACCURACIES]
+        images.append(torch.stack((a.mean(), a.median(), *shares, c.mean())))
+    means = torch.stack(images).mean(0).tolist() if images else [math.nan] * len(NORMAL_NAMES)
+    return dict(zip(NORMAL_NAMES, means, strict=True))
 
 
 def near_depth_edges(depth: Tensor) -> Tensor:

@@ -1,6 +1,5 @@
 """Rendering Gaussians as continuous stochastic solids, or by classic rasterisation."""
 
-from vg2gt.rendering.checks import UnrenderableError
-from vg2gt.rendering.renderer import Renderer, render
+from vg2gt.rendering.renderer import Renderer, UnrenderableError, render
 
 __all__ = ["Renderer", "UnrenderableError", "render"]

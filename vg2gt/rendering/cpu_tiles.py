@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import threading
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from vg2gt.kernels.constants import CONVERGED, MEDIAN_MAX_TRANSMITTANCE, TRANSMITTANCE_STOP
+from vg2gt.kernels.constants import CONVERGED, MEDIAN_MAX_TRANSMITTANCE, NEGLIGIBLE, TRANSMITTANCE_STOP
 from vg2gt.kernels.render_cpu import tiles
 from vg2gt.kernels.render_cpu.backward import backward_color, backward_rasterized, backward_solid
 from vg2gt.kernels.render_cpu.forward import forward_color, forward_rasterized, forward_solid
@@ -28,7 +29,6 @@ from vg2gt.rendering.scenes import Images, SceneViews
 TILES_PER_ITEM = 8
 HIT_CAPACITY = 192  # hits per block of rays for the depth solver; a tile with more gets a larger buffer
 CACHE_LINE = 64  # bytes
-NEGLIGIBLE = {np.dtype(np.float32): 30.0, np.dtype(np.float64): 90.0}  # squared sigmas beyond which a profile is 0
 
 _local = threading.local()
 
@@ -66,24 +66,20 @@ class _View:
     size: tuple[int, int]
 
     @property
-    def across(self) -> int:
-        """Tiles per image row."""
+    def across(self) -> int:  # tiles per image row
         return -(-self.size[1] // tiles.TILE)
 
     @property
-    def tiles(self) -> int:
-        """Tiles per image."""
+    def tiles(self) -> int:  # per image
         return self.across * -(-self.size[0] // tiles.TILE)
 
     @property
-    def tile_ranges(self) -> list[tuple[int, int]]:
-        """First and last tile (exclusive) of every work item."""
+    def tile_ranges(self) -> list[tuple[int, int]]:  # first and last tile (exclusive) of every work item
         starts = range(0, self.tiles, TILES_PER_ITEM)
         return [(start, min(start + TILES_PER_ITEM, self.tiles)) for start in starts]
 
     @property
-    def blocks(self) -> range:
-        """Indices of the blocks of ``BLOCK`` Gaussians."""
+    def blocks(self) -> range:  # of Gaussians
         return range(-(-len(self.means) // BLOCK))
 
 
@@ -178,41 +174,26 @@ def _prepare(view: _View, options: RenderOptions) -> _Lists:
 
 def _parameters(options: RenderOptions, dtype: np.dtype) -> np.ndarray:
     values = (
-        options.alpha_max, TRANSMITTANCE_STOP, MEDIAN_MAX_TRANSMITTANCE, options.near, NEGLIGIBLE[dtype],
+        options.alpha_max, TRANSMITTANCE_STOP, MEDIAN_MAX_TRANSMITTANCE, options.near, NEGLIGIBLE[dtype.itemsize],
         CONVERGED * np.finfo(dtype).eps,
     )  # fmt: skip
     return np.array(values, dtype)
 
 
-@dataclass(frozen=True)
-class _Scratch:
-    """One thread's scratch memory (names as in the kernels)."""
-
-    state: np.ndarray
-    sums: np.ndarray
-    hits: np.ndarray
-    counts: np.ndarray
-    staged: np.ndarray
-    spans: np.ndarray
-    total: np.ndarray
-    work: np.ndarray
-    indices: np.ndarray
-
-
-def _scratch(dtype: np.dtype) -> _Scratch:
-    """Returns this thread's scratch memory, kept between calls."""
+def _scratch(dtype: np.dtype) -> SimpleNamespace:
+    """Returns this thread's scratch memory (names as in the kernels), kept between calls."""
     buffers = _local.__dict__.setdefault("buffers", {})
     if dtype not in buffers:
-        buffers[dtype] = _Scratch(
-            _aligned(tiles.PLANES * tiles.PLANE, dtype),
-            _aligned(tiles.SUMS_ROWS * tiles.LANES, dtype),
-            _aligned(tiles.BLOCKS * HIT_CAPACITY * tiles.HIT_SIZE, dtype),
-            np.zeros(tiles.BLOCKS, np.int64),
-            np.zeros((tiles.STAGED, tiles.RECORD + 3), dtype),
-            np.zeros((tiles.STAGED, 4), np.int64),
-            np.empty(16, np.float64),
-            np.ones(FIELDS * CHUNK, np.float64),
-            np.empty(CHUNK, np.int64),
+        buffers[dtype] = SimpleNamespace(
+            state=_aligned(tiles.PLANES * tiles.PLANE, dtype),
+            sums=_aligned(tiles.SUMS_ROWS * tiles.LANES, dtype),
+            hits=_aligned(tiles.BLOCKS * HIT_CAPACITY * tiles.HIT_SIZE, dtype),
+            counts=np.zeros(tiles.BLOCKS, np.int64),
+            staged=np.zeros((tiles.STAGED, tiles.RECORD + 3), dtype),
+            spans=np.zeros((tiles.STAGED, 4), np.int64),
+            total=np.empty(16, np.float64),
+            work=np.ones(FIELDS * CHUNK, np.float64),
+            indices=np.empty(CHUNK, np.int64),
         )
     return buffers[dtype]
 

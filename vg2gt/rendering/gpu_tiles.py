@@ -7,13 +7,12 @@ Backward: visit the tiles again, write one gradient row per entry, sum and chain
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from vg2gt.kernels.constants import BRACKET_SIGMAS, CONVERGED, MEDIAN_MAX_TRANSMITTANCE, TRANSMITTANCE_STOP
+from vg2gt.kernels.constants import BRACKET_SIGMAS, CONVERGED, MEDIAN_MAX_TRANSMITTANCE, NEGLIGIBLE, TRANSMITTANCE_STOP
 from vg2gt.kernels.render_gpu import kernels as launchable
 from vg2gt.kernels.render_gpu.binning import ENTRIES
 from vg2gt.kernels.render_gpu.projection import BLOCK, REFUSED, SLOTS
@@ -24,10 +23,9 @@ from vg2gt.types import Cameras, Gaussians, Render
 
 kernels: Any = launchable  # Triton kernels are launched as kernel[grid](...), which type checkers do not know
 
-NEGLIGIBLE = {torch.float32: 30.0, torch.float64: 90.0}  # squared sigmas beyond which a profile is 0
 ROW_SHARE = 64  # gradient rows take 1 / ROW_SHARE of a GPU's memory
 ROWS = 3_000_000  # gradient rows held at once without a GPU
-SLOT_SHARE, SLOT_BYTES = 8, 256  # slots take 1 / SLOT_SHARE of a GPU's memory; bytes per slot, with its entries
+SLOT_SHARE, SLOT_BYTES = 8, 256  # slots rendered at once take 1 / SLOT_SHARE; bytes per slot, with its entries
 
 
 class RefusedError(ValueError):
@@ -47,24 +45,25 @@ def render_triton(
         rows: maximum number of gradient rows held at once, at least those of one view; None: by the device's memory.
 
     Raises:
-        RefusedError: if a value is not finite or out of range (see :mod:`vg2gt.rendering.checks`), or the Gaussians
+        RefusedError: if a value is not finite or out of range, or the Gaussians
             cover too many tiles.
         ValueError: if Gaussians times views exceed ``SLOTS``.
     """
     tensors = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
     tensors = (*tensors, cameras.world_to_camera, cameras.intrinsics, background)
     with torch.cuda.device_of(gaussians.means):  # Triton launches on the current device
-        some = max(1, _slots_at_once(gaussians.means.device) // max(1, len(gaussians)))
+        slots = _at_once(gaussians.means.device, SLOTS, SLOT_SHARE * SLOT_BYTES)
+        some = max(1, slots // max(1, len(gaussians)))
         parts = []
         for poses, intrinsics in zip(tensors[5].split(some, 1), tensors[6].split(some, 1), strict=True):
             inputs = (*tensors[:5], poses, intrinsics, background, gaussians.batch, cameras.size, options, rows)
             parts.append(_Render.apply(*inputs))
-    color, normal, depth, alpha = parts[0] if len(parts) == 1 else map(_join_views, zip(*parts, strict=True))
+    joined = parts[0] if len(parts) == 1 else [torch.cat(images, 1) for images in zip(*parts, strict=True)]
+    color, normal, depth, alpha = joined
     return Render(color, depth, normal, alpha)
 
 
-@dataclass(frozen=True)
-class _Lists:
+class _Lists(NamedTuple):
     """Tile entries of all views.
 
     Attributes:
@@ -94,7 +93,8 @@ class _Render(torch.autograd.Function):
         (height, width), options, rows = inputs[9:]
         poses, background = tensors[5], tensors[7]
         scenes, views = poses.shape[:2]
-        lists = _list(tensors, (height, width), options, rows or _rows_at_once(poses.device))
+        rows = rows or _at_once(poses.device, ROWS, ROW_SHARE * 4 * RECORD)
+        lists = _list(tensors, (height, width), options, rows)
         solid = options.mode == "solid"
         across, tiles = _tiles(height, width)
         make = torch.empty if options.geometry else torch.zeros
@@ -106,13 +106,12 @@ class _Render(torch.autograd.Function):
             lists.records, lists.members, lists.starts, background, color, normal, depth, alpha, transmittance, slopes,
             height, width, across, tiles,
             near=options.near, alpha_max=options.alpha_max, stop=TRANSMITTANCE_STOP,
-            negligible=NEGLIGIBLE[poses.dtype], median_max=MEDIAN_MAX_TRANSMITTANCE, sigmas=BRACKET_SIGMAS,
+            negligible=NEGLIGIBLE[poses.element_size()], median_max=MEDIAN_MAX_TRANSMITTANCE, sigmas=BRACKET_SIGMAS,
             steps=options.search_steps, newton=options.newton_steps > 0,
             converged=CONVERGED * torch.finfo(poses.dtype).eps,
             solid=solid, geometry=options.geometry, mean=options.depth == "expected", num_warps=1,
         )  # fmt: skip
-        listed = (lists.records, lists.ends, lists.members, lists.places, lists.starts)
-        ctx.save_for_backward(*tensors, *listed, color, normal, depth, transmittance, slopes)
+        ctx.save_for_backward(*tensors, *lists[:5], color, normal, depth, transmittance, slopes)
         ctx.chunks, ctx.size, ctx.options = lists.chunks, (height, width), options
         ctx.set_materialize_grads(False)
         return color, normal, depth, alpha
@@ -122,8 +121,7 @@ class _Render(torch.autograd.Function):
         """Returns gradients of Gaussians, cameras and background."""
         saved = ctx.saved_tensors
         means, quats, scales, opacities, sh, poses, intrinsics, _, batch = saved[:9]
-        records, ends, members, places, starts = saved[9:14]
-        lists = _Lists(records, ends, members, places, starts, ctx.chunks)
+        lists = _Lists(*saved[9:14], chunks=ctx.chunks)
         images = saved[14:]
         color, _, depth, transmittance, _ = images
         options: RenderOptions = ctx.options
@@ -178,22 +176,9 @@ def _degree(sh: Tensor) -> int:
     return round(sh.shape[1] ** 0.5) - 1
 
 
-def _join_views(images: tuple[Tensor, ...]) -> Tensor:
-    return torch.cat(images, 1)
-
-
-def _slots_at_once(device: torch.device) -> int:
-    """Returns how many slots (Gaussians times views) are rendered at once, which bounds the memory of sorting."""
-    if device.type != "cuda":
-        return SLOTS
-    return torch.cuda.get_device_properties(device).total_memory // (SLOT_SHARE * SLOT_BYTES)
-
-
-def _rows_at_once(device: torch.device) -> int:
-    """Returns float32 gradient rows held at once; by total GPU memory, as free memory would make results vary."""
-    if device.type != "cuda":
-        return ROWS
-    return torch.cuda.get_device_properties(device).total_memory // (ROW_SHARE * 4 * RECORD)
+def _at_once(device: torch.device, otherwise: int, each: int) -> int:
+    """Returns how many things of ``each`` bytes a GPU holds; by total memory, as free memory would vary results."""
+    return torch.cuda.get_device_properties(device).total_memory // each if device.type == "cuda" else otherwise
 
 
 def _list(tensors: tuple[Tensor, ...], size: tuple[int, int], options: RenderOptions, rows: int) -> _Lists:

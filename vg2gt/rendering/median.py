@@ -39,15 +39,7 @@ class MedianDepth(torch.autograd.Function):
     def forward(
         ctx: Any, alpha: Tensor, peak: Tensor, precision: Tensor, before: Tensor, options: RenderOptions
     ) -> Tensor:
-        """Solves ``T(d) = 1/2`` for every ray.
-
-        Args:
-            ctx: autograd context.
-            alpha: ``[P, N]`` opacity of every Gaussian on every ray, 0 where it is not hit.
-            peak: ``[P, N]`` depth of the response's peak.
-            precision: ``[P, N]`` inverse variance along the ray.
-            before: ``[P, N]`` transmittance in front in blending order, without gradient.
-            options: near plane, iterations, slope floor.
+        """Solves ``T(d) = 1/2`` for every ray; arguments as for :func:`ray_depth`.
 
         Returns:
             Depth ``[P]``; 0 where the final transmittance is 0.45 or more, or the median is nearer than ``near``.

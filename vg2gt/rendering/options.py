@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Literal
+
+from vg2gt.types import check_choice
 
 Mode = Literal["solid", "rasterized"]
 DepthKind = Literal["median", "expected"]
@@ -65,10 +67,3 @@ class RenderOptions:
         """Largest number of steps of the compiled renderers' search for the median depth."""
         # a Newton step may gain nothing: twice as many steps shrink the bracket at least as much as bisection alone
         return 2 * self.bisections + self.newton_steps if self.newton_steps else self.bisections
-
-
-def check_choice(name: str, value: object, literal: Any) -> None:
-    """Raises ValueError, naming the choices, unless ``value`` is one of the values of a ``Literal`` type."""
-    choices = get_args(literal)
-    if value not in choices:
-        raise ValueError(f"{name} must be one of {', '.join(choices)}, got {value!r}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -11,16 +10,21 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from vg2gt.geometry.spherical_harmonics import MAX_DEGREE
 from vg2gt.memory import note_sizes
-from vg2gt.rendering.checks import background_colors, check_finite, check_shapes, check_values
 from vg2gt.rendering.cpu_tiles import rasterize_cpu
 from vg2gt.rendering.dense import rasterize_dense
-from vg2gt.rendering.options import Mode, RenderOptions, check_choice
+from vg2gt.rendering.options import Mode, RenderOptions
 from vg2gt.rendering.scenes import render_scenes
 from vg2gt.rendering.selfcheck import require_trusted
-from vg2gt.types import Cameras, Gaussians, Render
+from vg2gt.types import Cameras, Gaussians, Render, check_choice
 
 Implementation = Literal["auto", "dense", "cpu", "triton"]
+MIN_SCALE = 1e-10  # smaller ones overflow the inverse covariance in float32
+
+
+class UnrenderableError(ValueError):
+    """Raised for values that are NaN, infinite or out of range; mismatched shapes raise a plain ValueError."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +57,7 @@ class Renderer(RenderOptions):
         options = self
         if mode is not None:
             options = replace(self, mode=mode, depth="median" if mode == "solid" else self.depth)
-        check_shapes(gaussians, cameras)
+        _check_shapes(gaussians, cameras)
         device = gaussians.means.device
         height, width = cameras.size
         scenes, views = cameras.world_to_camera.shape[:2]
@@ -61,14 +65,13 @@ class Renderer(RenderOptions):
         implementation = _resolve(self.implementation, device)
         dtype = torch.promote_types(gaussians.means.dtype, torch.float32)
         with torch.autocast(device.type, enabled=False):
-            color = background_colors(background, gaussians, scenes, dtype)  # [B, 3]
-            if implementation == "triton":
-                one = scenes == 1 or background is not None or gaussians.background is None
-                gaussians, cameras = gaussians.map(_floats_to(dtype)), cameras.map(_floats_to(dtype))
-                return _render_triton(gaussians, cameras, color[:1] if one else color, options)
-            check_values(gaussians, cameras)
-            check_finite("background", color)
+            color = _background(background, gaussians, scenes, dtype)  # [1 or B, 3]
+            if implementation != "triton":  # whose kernels check the values themselves
+                _check_values(gaussians, cameras, color)
             gaussians, cameras = gaussians.map(_floats_to(dtype)), cameras.map(_floats_to(dtype))
+            if implementation == "triton":
+                return _render_triton(gaussians, cameras, color, options)
+            color = color.expand(scenes, 3)
             if implementation == "dense":
                 return render_scenes(rasterize_dense, gaussians, cameras, color, options)
             host = (gaussians.to("cpu"), cameras.to("cpu"), color.cpu())
@@ -109,20 +112,17 @@ def render(
 
 def _render_triton(gaussians: Gaussians, cameras: Cameras, background: Tensor, options: RenderOptions) -> Render:
     """Renders with Triton, imported only here because CPU builds of torch lack it; ``background``: ``[1 or B, 3]``."""
-    if importlib.util.find_spec("triton") is None:
-        raise ValueError("implementation 'triton' needs the package triton; install a CUDA build of torch or use 'cpu'")
     from vg2gt.rendering.gpu_tiles import RefusedError, render_triton
 
-    black = background.new_zeros(3)
-    try:
-        if len(background) == 1:
-            return render_triton(gaussians, cameras, background[0], options)
-        render = render_triton(gaussians, cameras, black, options)
-    except RefusedError:
-        check_values(gaussians, cameras)
-        check_finite("background", background)
-        raise
     # The kernels take one background for all scenes.
+    one = len(background) == 1
+    try:
+        render = render_triton(gaussians, cameras, background[0] if one else background.new_zeros(3), options)
+    except RefusedError:
+        _check_values(gaussians, cameras, background)
+        raise
+    if one:
+        return render
     behind = (1 - render.alpha)[:, :, None] * background[:, None, :, None, None]
     return replace(render, color=render.color + behind)
 
@@ -149,3 +149,78 @@ def automatic(device: torch.device) -> str:
 
 def _floats_to(dtype: torch.dtype) -> Callable[[Tensor], Tensor]:
     return lambda tensor: tensor.to(dtype) if tensor.is_floating_point() else tensor
+
+
+def _check_shapes(gaussians: Gaussians, cameras: Cameras) -> None:
+    """Raises ValueError, naming the argument, if shapes do not match."""
+    views, count = tuple(cameras.world_to_camera.shape[:2]), len(gaussians.means)
+    coefficients = gaussians.sh.shape[1] if gaussians.sh.dim() == 3 else 0
+    if coefficients not in {(degree + 1) ** 2 for degree in range(MAX_DEGREE + 1)}:
+        raise ValueError(f"sh must be [G, (L + 1)^2, 3] with L from 0 to {MAX_DEGREE}, got {tuple(gaussians.sh.shape)}")
+    of_cameras = {"world_to_camera": (*views, 4, 4), "intrinsics": (*views, 3, 3)}
+    of_gaussians = {
+        "means": (count, 3),
+        "quats": (count, 4),
+        "scales": (count, 3),
+        "opacities": (count,),
+        "sh": (count, coefficients, 3),
+        "batch": (count,),
+    }
+    for record, expected in ((cameras, of_cameras), (gaussians, of_gaussians)):
+        for name, shape in expected.items():
+            found = tuple(getattr(record, name).shape)
+            if found != shape:
+                raise ValueError(f"{name} must be {list(shape)} for {count} Gaussians in {views} views, got {found}")
+
+
+def _check_values(gaussians: Gaussians, cameras: Cameras, background: Tensor) -> None:
+    """Raises ValueError unless all values are finite and in range and the Gaussians are sorted by scene."""
+    _check_finite("world_to_camera", cameras.world_to_camera)
+    _check_finite("intrinsics", cameras.intrinsics)
+    _check_finite("background", background)
+    focal = cameras.intrinsics[..., [0, 1], [0, 1]]
+    _require("intrinsics", focal > 0, "be pinhole matrices with positive focal lengths")
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        _check_finite(name, getattr(gaussians, name))
+    if len(gaussians) == 0:
+        return
+    _require("scales", gaussians.scales >= MIN_SCALE, f"be at least {MIN_SCALE} (standard deviations in scene units)")
+    _require("opacities", (gaussians.opacities >= 0) & (gaussians.opacities <= 1), "be in [0, 1]")
+    _require("quats", gaussians.quats.detach().abs().sum(-1) > 0, "have nonzero norm")
+    batch, scenes = gaussians.batch, len(cameras.world_to_camera)
+    if batch[0] < 0 or batch[-1] >= scenes or (batch[1:] < batch[:-1]).any():
+        raise ValueError(
+            f"batch must be sorted scene indices from 0 to {scenes - 1} (the cameras hold {scenes} scenes); "
+            "sort the Gaussians by scene"
+        )
+
+
+def _check_finite(name: str, tensor: Tensor) -> None:
+    """Raises UnrenderableError if a tensor holds NaN or infinity, naming it and the first bad position."""
+    if torch.isfinite(tensor.detach().sum()):  # the common case in one fast pass
+        return
+    where = torch.nonzero(~torch.isfinite(tensor))
+    if len(where):
+        raise UnrenderableError(
+            f"{name} holds {len(where)} NaN or infinite values, the first at {where[0].tolist()}; "
+            "look for a diverging loss or an invalid input upstream"
+        )
+
+
+def _background(
+    background: Tensor | Sequence[float] | None, gaussians: Gaussians, scenes: int, dtype: torch.dtype
+) -> Tensor:
+    """Returns the background ``[1 or B, 3]``: the given colour, else the Gaussians' own, else black."""
+    own = gaussians.background if background is None else background
+    if own is None:
+        return gaussians.means.new_zeros(1, 3, dtype=dtype)
+    color = torch.as_tensor(own, dtype=dtype, device=gaussians.means.device)
+    if tuple(color.shape) not in ((3,), (scenes, 3)):
+        raise ValueError(f"background must be one colour [3] or one per scene [{scenes}, 3], got {list(color.shape)}")
+    return color.view(-1, 3)
+
+
+def _require(name: str, good: Tensor, expectation: str) -> None:
+    if not good.all():
+        where = torch.nonzero(~good)
+        raise UnrenderableError(f"{name} must {expectation}; {len(where)} do not, the first at {where[0].tolist()}")

@@ -57,14 +57,8 @@ class SceneViews:
 
     def gather(self, index: Tensor) -> SceneViews:
         """Returns the Gaussians of the given indices, in that order."""
-        return replace(
-            self,
-            means=self.means[index],
-            quats=self.quats[index],
-            scales=self.scales[index],
-            opacities=self.opacities[index],
-            colors=self.colors[:, index],
-        )
+        some = {name: getattr(self, name)[index] for name in ("means", "quats", "scales", "opacities")}
+        return replace(self, **some, colors=self.colors[:, index])
 
 
 Rasterizer = Callable[[SceneViews, RenderOptions], Images]

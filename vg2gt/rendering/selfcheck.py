@@ -1,7 +1,7 @@
 """Self-check of a device's compiled kernels against the reference, run once before their first use.
 
 Two small fixed scenes are rendered by the kernels on the device and by the dense reference in float64 on the CPU. The
-result is cached per device, driver, versions and kernel sources.
+result is cached per device, driver, versions and sources.
 """
 
 from __future__ import annotations
@@ -9,9 +9,8 @@ from __future__ import annotations
 import hashlib
 import importlib.metadata
 import importlib.util
-from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
@@ -24,9 +23,7 @@ from vg2gt.kernels.compiled import cache_folder
 from vg2gt.rendering.dense import rasterize_dense
 from vg2gt.rendering.options import Mode, RenderOptions
 from vg2gt.rendering.scenes import render_scenes
-from vg2gt.types import Cameras, Gaussians, Render
-
-RenderFunction = Callable[..., Render]
+from vg2gt.types import Cameras, Gaussians
 
 VALUES = 5e-5  # largest allowed error of an image; float32 rounding gives about 2e-6
 GRADIENTS = 5e-4  # largest allowed error of a gradient, relative to its norm; float32 rounding: about 1e-6
@@ -35,10 +32,7 @@ SCENES, COUNT, SIZE, VIEWS, DEGREE = 2, 7, (9, 11), 2, 2  # COUNT: Gaussians per
 STREAM = 44  # seed of the scenes, with which three quarters of the rays have a well-conditioned depth
 ROWS = 8  # gradient rows held at once: fewer than a view has, so that views are processed one by one
 _VG2GT = Path(__file__).resolve().parents[1]
-SOURCES = (
-    Path(__file__).resolve(), _VG2GT / "rendering" / "gpu_tiles.py",
-    *sorted((_VG2GT / "kernels" / "render_gpu").glob("*.py")),
-)  # fmt: skip
+SOURCES = [*sorted(_VG2GT.glob("kernels/render_gpu/*.py")), *sorted(_VG2GT.glob("rendering/*.py"))]
 ADVICE = (
     "To render without these kernels (many times slower), use renderer.implementation=cpu (vg2gt reconstruct) "
     "or --device cpu (other commands)"
@@ -92,20 +86,25 @@ def require_trusted(device: torch.device) -> None:
 
 @lru_cache
 def _refusal(found_on: str, device: str) -> str:
-    """Returns what is wrong with the kernels; empty if nothing is."""
-    agreement = known(found_on)
-    if agreement is None:
+    """Returns what is wrong with the kernels, empty if nothing is; from the cache if they have been compared."""
+    folder, known = cache_folder(), {}
+    with suppress(OSError, ValueError):
+        known = read_json(folder / "gpu_agreement.json") if folder else {}
+    if found_on not in known:
         try:
             agreement = compare(torch.device(device))
         except Exception as error:
             reason = " ".join(str(error).split()) or type(error).__name__
             return f"do not run ({type(error).__name__}: {reason[:300]})"
-        remember(found_on, agreement)
-    return "" if agreement.good else f"disagree with the reference: {agreement}"
+        known[found_on] = "" if agreement.good else f"disagree with the reference: {agreement}"
+        with suppress(OSError):
+            if folder:
+                write_json(folder / "gpu_agreement.json", known)
+    return known[found_on]
 
 
 def identity(device: torch.device) -> str:
-    """Returns the cache key of a result: device, driver, versions of torch and Triton, hash of the kernel sources."""
+    """Returns the cache key of a result: device, driver, versions of torch and Triton, hash of the sources."""
     name, driver = device.type, ""
     if device.type == "cuda":
         name = torch.cuda.get_device_name(device)
@@ -117,29 +116,6 @@ def identity(device: torch.device) -> str:
     return f"{name}, {driver}torch {torch.__version__}, kernels {source.hexdigest()[:12]}"
 
 
-def known(found_on: str) -> Agreement | None:
-    """Returns the cached result, or None."""
-    with suppress(OSError, ValueError, TypeError, KeyError):
-        return Agreement(**read_json(_file())[found_on])
-    return None
-
-
-def remember(found_on: str, agreement: Agreement) -> None:
-    """Caches a result, if the cache folder is writable."""
-    with suppress(OSError, TypeError):
-        before = {}
-        with suppress(OSError, ValueError):
-            before = read_json(_file())
-        write_json(_file(), {**before, found_on: asdict(agreement)})
-
-
-def _file() -> Path:
-    folder = cache_folder()
-    if folder is None:
-        raise OSError("no folder to keep it in")
-    return folder / "gpu_agreement.json"
-
-
 def compare(device: torch.device, modes: tuple[Mode, ...] = MODES) -> Agreement:
     """Renders the fixed scenes with the kernels on ``device`` and with the reference, and returns the errors.
 
@@ -147,48 +123,38 @@ def compare(device: torch.device, modes: tuple[Mode, ...] = MODES) -> Agreement:
         device: device that runs the kernels; a CPU if Triton interprets them.
         modes: render modes to compare.
     """
-    from vg2gt.rendering.gpu_tiles import render_triton
-
-    def kernels(gaussians: Gaussians, cameras: Cameras, mode: Mode, background: Tensor) -> Render:
-        return render_triton(gaussians, cameras, background, RenderOptions(mode=mode), rows=ROWS)
-
     worst = torch.zeros(2, dtype=torch.float64)
     # The first render may be part of an evaluation without gradients; the comparison needs them.
     with torch.inference_mode(False), torch.enable_grad(), torch.autocast(device.type, enabled=False):
         for mode in modes:
-            expected, expected_grads = _run(_reference, mode, torch.device("cpu"), torch.float64)
-            found, grads = _run(kernels, mode, device, torch.float32)
+            (found, grads), (expected, expected_grads) = _run(mode, device), _run(mode, None)
             values = [(a - b).abs().max() for a, b in zip(found, expected, strict=True)]
             relative = [(a - b).norm() / b.norm() for a, b in zip(grads, expected_grads, strict=True)]
             worst = torch.maximum(worst, torch.stack((torch.stack(values).max(), torch.stack(relative).max())))
     return Agreement(*worst.tolist())
 
 
-def _reference(gaussians: Gaussians, cameras: Cameras, mode: Mode, background: Tensor) -> Render:
-    return render_scenes(rasterize_dense, gaussians, cameras, background.expand(SCENES, 3), RenderOptions(mode=mode))
+def _run(mode: Mode, device: torch.device | None) -> tuple[list[Tensor], list[Tensor]]:
+    """Returns images of the kernels on a device (None: of the reference), and gradients of a weighted sum of them."""
+    place = {"device": device or "cpu", "dtype": torch.float32 if device else torch.float64}
+    inputs = [tensor.to(**place).requires_grad_() for tensor in _fixed_scene()]
+    *parameters, poses, intrinsics, background = inputs
+    batch = torch.arange(SCENES, device=device).repeat_interleave(COUNT)
+    gaussians, cameras = Gaussians(*parameters, batch=batch), Cameras(poses, intrinsics, SIZE)
+    options = RenderOptions(mode)
+    if device is None:
+        out = render_scenes(rasterize_dense, gaussians, cameras, background.expand(SCENES, 3), options)
+    else:
+        from vg2gt.rendering.gpu_tiles import render_triton
 
-
-def _run(
-    render: RenderFunction, mode: Mode, device: torch.device, dtype: torch.dtype
-) -> tuple[list[Tensor], list[Tensor]]:
-    """Returns all images, and the gradient of a weighted sum of them for every input, in float64 on the CPU."""
-    inputs = [tensor.to(device, dtype).requires_grad_() for tensor in fixed_scene()]
-    gaussians, cameras = as_scene(inputs)
-    out = render(gaussians, cameras, mode, inputs[-1])
+        out = render_triton(gaussians, cameras, background, options, rows=ROWS)
     images = [out.color, out.depth, out.normal, out.alpha]
-    weights = [_numbers(image.numel(), 20 + index).view(image.shape) for index, image in enumerate(images)]
-    grads = torch.autograd.grad(images, inputs, [weight.to(device, dtype) for weight in weights])
+    weights = [_numbers(image.numel(), 20 + index).view(image.shape).to(image) for index, image in enumerate(images)]
+    grads = torch.autograd.grad(images, inputs, weights)
     return [image.detach().cpu().double() for image in images], [grad.cpu().double() for grad in grads]
 
 
-def as_scene(inputs: Sequence[Tensor]) -> tuple[Gaussians, Cameras]:
-    """Builds Gaussians and cameras from the tensors of :func:`fixed_scene`, in any precision and on any device."""
-    means, quats, scales, opacities, sh, poses, intrinsics, _ = inputs
-    batch = torch.arange(SCENES, device=means.device).repeat_interleave(COUNT)
-    return Gaussians(means, quats, scales, opacities, sh, batch), Cameras(poses, intrinsics, SIZE)
-
-
-def fixed_scene() -> tuple[Tensor, ...]:
+def _fixed_scene() -> tuple[Tensor, ...]:
     """Returns means, quats, scales, opacities, sh, poses, intrinsics and background of the two scenes, in float64."""
     (height, width), total = SIZE, SCENES * COUNT
     depth = 2.5 + 1.2 * _numbers(total, STREAM)

@@ -185,29 +185,19 @@ def _median(
 
 
 @triton.jit
-def _meet(records, members, place, before, px, py, alpha_max: tl.constexpr, stop: tl.constexpr):
-    """Returns the next Gaussian's record, response, alpha (0: no hit), transmittance behind it, and if any ray hits it.
-
-    ``before`` is the transmittance in front of it, negative where the ray has stopped.
-    """
-    g = records + tl.load(members + place).to(tl.int64) * _RECORD
-    _, _, _, s, r, inverse, _, on, alpha = _respond(g, px, py, alpha_max, True)
-    on = on & (before > 0)
-    after = before * (1.0 - alpha)
-    kept = on & (after >= stop)
-    behind = tl.where(kept, after, tl.where(on, -before, before))
-    return g, s, r, inverse, tl.where(kept, alpha, 0.0), behind, tl.max(on.to(tl.int32), 0) > 0
-
-
-@triton.jit
 def _transmit(records, members, place, last, px, py, wanted, t, alpha_max: tl.constexpr, stop: tl.constexpr):
     """Returns squared transmittance at depths ``t`` (numerator, denominator), and ``-2 d ln T / dt``."""
     before = tl.where(wanted, 1.0, -1.0).to(px.dtype)
     numerator, denominator, steep = px * 0 + 1.0, px * 0 + 1.0, px * 0
     live = place < last
     while live:
-        g, s, r, inverse, alpha, before, met = _meet(records, members, place, before, px, py, alpha_max, stop)
-        if met:
+        g = records + tl.load(members + place).to(tl.int64) * _RECORD
+        _, _, _, s, r, inverse, _, on, alpha = _respond(g, px, py, alpha_max, True)
+        on = on & (before > 0)
+        after = before * (1.0 - alpha)
+        kept = on & (after >= stop)
+        if tl.max(on.to(tl.int32), 0) > 0:
+            alpha = tl.where(kept, alpha, 0.0)
             precision = tl.load(g + 8) * r
             offset = t - tl.load(g + 7) * s * inverse
             bell = alpha * tl.exp(-0.5 * precision * offset * offset)
@@ -215,6 +205,7 @@ def _transmit(records, members, place, last, px, py, wanted, t, alpha_max: tl.co
             numerator *= tl.where(offset <= 0, free, (1.0 - alpha) * (1.0 - alpha))
             denominator *= tl.where(offset <= 0, 1.0, free)
             steep += bell * precision * tl.abs(offset) / free
+        before = tl.where(kept, after, tl.where(on, -before, before))
         place += 1
         live = (place < last) & (tl.max(before, 0) > 0)
     return numerator, denominator, steep

@@ -30,9 +30,7 @@ LEAST = 0.005  # share of unsupported pixels below which there is no shell
 
 
 @torch.no_grad()
-def far_shell(
-    images: Tensor, depth: Tensor, cameras: Cameras, mask: Tensor | None = None, count: int = COUNT
-) -> Gaussians | None:
+def far_shell(images: Tensor, depth: Tensor, cameras: Cameras, mask: Tensor | None = None) -> Gaussians | None:
     """Builds the shell of one scene from flat Gaussians that face the cameras.
 
     Args:
@@ -40,7 +38,6 @@ def far_shell(
         depth: ``[V, H, W]`` supported z-depth, 0 = none.
         cameras: cameras of the views (B = 1).
         mask: ``[V, H, W]`` in [0, 1]; pixels at or below 0.5 are ignored. None: all count.
-        count: number of Gaussians on the full sphere.
 
     Returns:
         The shell; None if nearly every pixel has a depth, or no pixel has one.
@@ -55,9 +52,9 @@ def far_shell(
     rays = F.normalize(rays.reshape(-1, 3)[rows], dim=-1)
     colors = images.movedim(1, -1).reshape(-1, 3)[rows]
     # mean colour of the rays around each of N directions
-    directions = _fibonacci(count).to(rays)
-    spacing = math.sqrt(4 * math.pi / count)
-    total = PRIOR * F.pad(colors.mean(0, keepdim=True), (0, 1), value=1.0).repeat(count, 1)  # [N, 4]
+    directions = _fibonacci().to(rays)
+    spacing = math.sqrt(4 * math.pi / COUNT)
+    total = PRIOR * F.pad(colors.mean(0, keepdim=True), (0, 1), value=1.0).repeat(COUNT, 1)  # [N, 4]
     for ray, color in zip(rays.split(4096), colors.split(4096), strict=True):
         weight = torch.exp((ray @ directions.T - 1) / (BLUR * spacing) ** 2)
         total += weight.T @ F.pad(color, (0, 1), value=1.0)
@@ -67,10 +64,10 @@ def far_shell(
     return Gaussians(
         means=centers.mean(0) + radius * directions,
         quats=_facing(directions),
-        scales=radius * spacing * WIDTH * directions.new_tensor([1.0, 1.0, THIN]).repeat(count, 1),
-        opacities=directions.new_full((count,), OPACITY),
+        scales=radius * spacing * WIDTH * directions.new_tensor([1.0, 1.0, THIN]).repeat(COUNT, 1),
+        opacities=directions.new_full((COUNT,), OPACITY),
         sh=rgb_to_sh(total[:, :3] / total[:, 3:])[:, None],
-        batch=torch.zeros(count, dtype=torch.int64, device=rays.device),
+        batch=torch.zeros(COUNT, dtype=torch.int64, device=rays.device),
     )
 
 
@@ -82,10 +79,10 @@ def is_far(gaussians: Gaussians, depth: Tensor, cameras: Cameras) -> Tensor:
     return torch.cdist(gaussians.means, camera_centers(cameras)[0]).amin(1) > FAR * known.median()
 
 
-def _fibonacci(count: int) -> Tensor:
+def _fibonacci() -> Tensor:
     """Returns directions ``[N, 3]`` spread evenly over the sphere."""
-    step = torch.arange(count, dtype=torch.float64) + 0.5
-    z, angle = 1 - 2 * step / count, math.pi * (1 + math.sqrt(5)) * step
+    step = torch.arange(COUNT, dtype=torch.float64) + 0.5
+    z, angle = 1 - 2 * step / COUNT, math.pi * (1 + math.sqrt(5)) * step
     ring = (1 - z.square()).sqrt()
     return torch.stack((ring * angle.cos(), ring * angle.sin(), z), -1)
 

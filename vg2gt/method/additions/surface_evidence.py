@@ -66,23 +66,6 @@ class PointFrames:
         change = torch.where(facing < -GRAZING, change, 0.0).clamp(-MAX_DEPTH_CHANGE, MAX_DEPTH_CHANGE)
         return torch.cat((local, change[:, None]), -1)
 
-    def evidence(
-        self, to_surface: Tensor, voxel_size: Tensor, batch: Tensor, clear: Tensor | None
-    ) -> tuple[Tensor, Tensor]:
-        """Returns the result of :meth:`in_camera` ``[N, 4]``, and the gate ``[B]`` on the network's changes.
-
-        Args:
-            to_surface: ``[N, 3]`` in world axes and voxels.
-            voxel_size: ``[B]`` scene units per voxel.
-            batch: ``[N]`` scene index, sorted.
-            clear: ``[N]`` bool, points away from silhouettes; the evidence of others is 0. None: no gate, all count.
-        """
-        seen = self.in_camera(to_surface, voxel_size[batch])
-        if clear is None:
-            return seen, torch.ones_like(voxel_size)
-        seen = torch.where(clear[:, None], seen, 0)
-        return seen, gate(disagreement(seen[:, -1], clear, batch, len(voxel_size)))
-
 
 def disagreement(change: Tensor, usable: Tensor, batch: Tensor, scenes: int) -> Tensor:
     """Returns the median absolute change of depth ``[B]`` over the usable points of each scene; 0 if there are none.

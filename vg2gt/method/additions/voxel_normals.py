@@ -7,12 +7,14 @@ visible over three cells.
 from __future__ import annotations
 
 import itertools
+import math
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from vg2gt.geometry.symmetric import FULL, UPPER, smallest_eigenvector
-from vg2gt.kernels.threads import compilable
+from vg2gt.kernels.threads import compilable, over_voxels
 from vg2gt.kernels.voxel_normals import spread_around
 from vg2gt.method.grid import VoxelPlan, mixed_radix_keys
 
@@ -41,7 +43,7 @@ def surface_normals(spread: Tensor, facing: Tensor, offset: Tensor, plan: VoxelP
     own = facing_normals(spread, facing)
     if kernel == 1 or not len(plan):
         return own
-    around = around_compiled if compilable(spread, own, offset) else around_reference
+    around = _around_compiled if compilable(spread, own, offset) else _around_reference
     return facing_normals(around(spread, own, offset, plan), facing)
 
 
@@ -63,18 +65,10 @@ def facing_normals(spread: Tensor, facing: Tensor) -> Tensor:
     return torch.where((normal * sight).sum(-1, keepdim=True) < 0, -normal, normal).to(facing.dtype)
 
 
-def around_reference(spread: Tensor, normal: Tensor, offset: Tensor, plan: VoxelPlan) -> Tensor:
-    """Returns the covariances of the points in the 3x3x3 cells around every voxel, in plain torch.
+def _around_reference(spread: Tensor, normal: Tensor, offset: Tensor, plan: VoxelPlan) -> Tensor:
+    """Returns the covariances ``[M, 3, 3]`` of the points in the 3x3x3 cells around every voxel, in plain torch.
 
-    Args:
-        spread: ``[M, 3, 3]`` covariances of the points' positions, in cells^2.
-        normal: ``[M, 3]`` normal of each voxel's own tangent plane.
-        offset: ``[M, 3]`` mean positions relative to the cell centres, in cells.
-        plan: the voxels.
-
-    Returns:
-        ``[M, 3, 3]``. Cells are weighted by their number of points and by the distance of their mean from the tangent
-        plane.
+    Cells are weighted by their number of points, and by the distance of their mean from the voxel's own tangent plane.
     """
     voxel, other, shift, lengths = _pairs(plan)
     x, y, z = (offset.index_select(0, other) - offset.index_select(0, voxel) + shift.to(offset.dtype)).unbind(-1)  # [P]
@@ -89,11 +83,17 @@ def around_reference(spread: Tensor, normal: Tensor, offset: Tensor, plan: Voxel
     return around[:, FULL].unflatten(-1, (3, 3))
 
 
-def around_compiled(spread: Tensor, normal: Tensor, offset: Tensor, plan: VoxelPlan) -> Tensor:
-    """:func:`around_reference` compiled for the CPU, without storing the pairs."""
+def _around_compiled(spread: Tensor, normal: Tensor, offset: Tensor, plan: VoxelPlan) -> Tensor:
+    """:func:`_around_reference` compiled for the CPU, without storing the pairs."""
     keys, (step_x, step_y, _) = mixed_radix_keys(plan.grid, plan.batch, margin=1)  # ascending, like the plan's voxels
     columns = torch.tensor([i * step_x + j * step_y - 1 for i, j in COLUMNS])
-    return spread_around(keys, columns, plan.counts, spread, normal, offset, SAME_SURFACE)
+    above = keys.new_full((1,), torch.iinfo(keys.dtype).max)  # a sentinel that ends the scan of the keys
+    around = torch.empty_like(spread, memory_format=torch.contiguous_format)
+    inputs = (torch.cat((keys, above)), columns, plan.counts, spread, normal, offset, around)
+    arrays = [values.detach().contiguous().numpy() for values in inputs]
+    sharpness = np.float32(math.sqrt(0.5) / SAME_SURFACE)
+    over_voxels(len(keys), lambda first, last: spread_around(*arrays, np.empty(9, np.uintp), sharpness, first, last))
+    return around
 
 
 def _pairs(plan: VoxelPlan) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -94,7 +94,8 @@ class ViewCheck:
             frames: ``[B, V]`` frame numbers in temporal order; None: unknown, so nothing is dropped as moving.
         """
         times = [None] * len(geometry.depth) if frames is None else frames.to(geometry.depth.device)
-        scenes = [self._check(*_scene(geometry, index), time) for index, time in enumerate(times)]
+        depth = geometry.depth.float().nan_to_num(0.0, 0.0, 0.0)
+        scenes = [self._check(depth[b], geometry.cameras.scene(b), time) for b, time in enumerate(times)]
         return Support(*(torch.stack(parts) for parts in zip(*scenes, strict=True)))
 
     def _check(self, depth: Tensor, cameras: Cameras, frames: Tensor | None) -> tuple[Tensor, Tensor]:
@@ -151,13 +152,6 @@ def moved(
 def weighted(views: int) -> bool:
     """Returns whether near views count more in a scene with this many views (:func:`count_views`)."""
     return views > MANY
-
-
-def _scene(geometry: Geometry, index: int) -> tuple[Tensor, Cameras]:
-    """Returns the depth ``[V, H, W]`` of one scene, 0 where not finite, and its cameras (B = 1)."""
-    depth = geometry.depth[index].float().nan_to_num(0.0, 0.0, 0.0)
-    one, cameras = slice(index, index + 1), geometry.cameras
-    return depth, Cameras(cameras.world_to_camera[one], cameras.intrinsics[one], cameras.size)
 
 
 @torch.no_grad()

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from vg2gt.geometry.cameras import compose, invert_rigid, ray_directions, transform_points
-from vg2gt.kernels.view_counts import HEAVIEST, NEAREST, count_compiled
+from vg2gt.kernels.threads import parallel_for
+from vg2gt.kernels.view_counts import HEAVIEST, NEAREST, count_view
 from vg2gt.types import Cameras, TensorRecord
 
 
@@ -108,7 +110,9 @@ def _count_compiled(
     back = torch.linalg.inv(intrinsics)[:, None]
     matrix = torch.cat((to_pixel[..., :3] @ back, to_pixel[..., 3:]), -1).float().contiguous().numpy()
     maps = depth.detach().float().contiguous().numpy()
-    sums = count_compiled(maps, partners.contiguous().numpy(), matrix, tolerance, margin, weighted)
+    sums = [np.zeros(maps.shape, np.float32) for _ in range(3)]
+    inputs = (maps, partners.contiguous().numpy(), matrix, np.float32(tolerance), np.float32(margin), weighted)
+    parallel_for(range(len(maps)), lambda view: count_view(view, *inputs, *sums))
     return ViewCounts(*(torch.from_numpy(total).to(depth.dtype) for total in sums))
 
 
