@@ -138,7 +138,6 @@ def test_hydra_says_what_is_wrong_with_an_override_and_what_is_near(words: str, 
 
 
 WITHOUT_EXTRAS = {
-    "view scene.ply": "view",
     "train logger=tensorboard": "log",
     "train logger=wandb": "log",
     "train backend=da3_small": "hub",
@@ -150,7 +149,7 @@ WITHOUT_EXTRAS = {
 
 @pytest.mark.parametrize("words", WITHOUT_EXTRAS)
 def test_a_missing_optional_package_is_one_line_before_any_work(words, said, tmp_path, monkeypatch):
-    for package in ("viser", "tensorboard", "wandb", "huggingface_hub", "av", "onnx", "onnxscript"):
+    for package in ("tensorboard", "wandb", "huggingface_hub", "av", "onnx", "onnxscript"):
         monkeypatch.setitem(sys.modules, package, None)
     (tmp_path / "clip.mp4").touch()  # neither it nor scene.ply, which is not there, is looked at
     line, _ = said(*words.split())

@@ -82,10 +82,10 @@ class Page:
             self.requests.append(message["params"]["request"]["url"])
         return message
 
-    def open(self, address: str, width: int, height: int, mobile: bool = False) -> None:
+    def open(self, address: str, width: int, height: int) -> None:
         """Loads a page in a window of the given size, one device pixel a pixel."""
         self.requests.clear()
-        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=mobile)
+        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
         self.call("Page.navigate", url=address)
         while self.run("document.readyState") != "complete":
             time.sleep(0.05)
