@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from vg2gt.reconstruction.pipeline import reconstruct, reconstruct_with
     from vg2gt.reconstruction.scene import Scene
     from vg2gt.runs.load import load_model
-    from vg2gt.runs.pretrained import from_pretrained, list_models, push_to_hub, save_pretrained
+    from vg2gt.runs.pretrained import from_pretrained, list_models, save_pretrained
 
 __all__ = [
     "VG2GT",
@@ -20,7 +20,6 @@ __all__ = [
     "from_pretrained",
     "list_models",
     "load_model",
-    "push_to_hub",
     "reconstruct",
     "reconstruct_with",
     "save_pretrained",
@@ -30,7 +29,7 @@ __version__ = "0.1.0"
 _HOMES = {
     "VG2GT": "vg2gt.model",
     "load_model": "vg2gt.runs.load",
-    **dict.fromkeys(("from_pretrained", "list_models", "push_to_hub", "save_pretrained"), "vg2gt.runs.pretrained"),
+    **dict.fromkeys(("from_pretrained", "list_models", "save_pretrained"), "vg2gt.runs.pretrained"),
     "Scene": "vg2gt.reconstruction.scene",
     "reconstruct": "vg2gt.reconstruction.pipeline",
     "reconstruct_with": "vg2gt.reconstruction.pipeline",

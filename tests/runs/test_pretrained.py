@@ -37,19 +37,3 @@ def test_a_name_a_folder_and_a_name_on_the_hub_give_the_same_model(
     assert asked == [("somebody/rooms", name, "v1") for name in FILES[:2]]
     with pytest.raises(FileNotFoundError, match="no such checkpoint or run"):
         vg2gt.from_pretrained("nowhere", device="cpu")
-
-
-def test_what_is_uploaded_is_data_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    calls: list[tuple] = []
-
-    class Api:
-        def create_repo(self, repo: str, private: bool, exist_ok: bool) -> None:
-            calls.append((repo, private, exist_ok))
-
-        def upload_folder(self, repo_id: str, folder_path: str, allow_patterns: list[str]) -> str:
-            calls.append((repo_id, sorted(allow_patterns)))
-            return "commit"
-
-    monkeypatch.setattr("huggingface_hub.HfApi", Api)
-    assert vg2gt.push_to_hub(SHIPPED, "me/rooms", tmp_path / "mine") == "commit"
-    assert calls == [("me/rooms", False, True), ("me/rooms", FILES)]

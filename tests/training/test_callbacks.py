@@ -12,7 +12,7 @@ import pytest
 
 from tests.reliability.crash_harness import RUN
 from tests.training_helpers import small_config
-from vg2gt.runs.checkpoints import newest_valid, read_checkpoint
+from vg2gt.runs.checkpoints import newest, read_checkpoint
 from vg2gt.training.distributed import ending_together
 from vg2gt.training.loop import build, train
 
@@ -55,7 +55,7 @@ def test_the_best_by_a_metric_is_kept(tmp_path: Path, cache: Path) -> None:
     assert len(during) == 3
     best = read_checkpoint(tmp_path / "checkpoints" / "best.ckpt")
     assert best["global_step"] == 1 + list(during.values()).index(max(during.values()))
-    assert newest_valid(tmp_path / "checkpoints").name == "step-3.ckpt"
+    assert newest(tmp_path / "checkpoints").name == "step-3.ckpt"
 
 
 def rows(folder: Path) -> list[dict[str, str]]:
@@ -71,7 +71,7 @@ def test_a_signal_saves_without_another_evaluation(tmp_path: Path, cache: Path, 
     run = build(small_config(tmp_path, cache, *RUN))
     run.trainer.callbacks.append(stopped)  # pyright: ignore[reportAttributeAccessIssue]
     run.trainer.fit(run.module, datamodule=run.datamodule)
-    assert (newest_valid(tmp_path / "checkpoints").name, stopped.evaluations) == ("step-3.ckpt", 0)
+    assert (newest(tmp_path / "checkpoints").name, stopped.evaluations) == ("step-3.ckpt", 0)
     assert signal.getsignal(number) == before
 
 

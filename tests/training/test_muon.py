@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from vg2gt.training.module import parameter_groups
 from vg2gt.training.muon import MuonAdamW, orthogonalized
-from vg2gt.training.schedule import parameter_groups
 
 
 class Parts(nn.Module):

@@ -5,7 +5,7 @@ from itertools import pairwise
 import pytest
 from torch import nn
 
-from vg2gt.training.schedule import cosine_with_warmup, parameter_groups
+from vg2gt.training.module import cosine_with_warmup, parameter_groups
 
 
 def test_papers_schedule_goes_from_initial_to_final_rate() -> None:

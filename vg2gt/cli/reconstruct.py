@@ -71,16 +71,9 @@ def parser() -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Runs the command; errors are reported in one line."""
-    from rich.console import Console
-    from rich.logging import RichHandler
-
     given, overrides = separate(argv)
     options = parser().parse_args(given)
-    logging.basicConfig(
-        level=logging.WARNING,
-        format="%(message)s",
-        handlers=[RichHandler(console=Console(stderr=True), show_time=False, show_path=False)],
-    )
+    logging.basicConfig(level=logging.WARNING, format="%(message)s")
     with errors_in_one_line():
         run(options, overrides)
 

@@ -47,6 +47,8 @@ def from_pretrained(
 def save_pretrained(ckpt: str | Path, folder: str | Path) -> Path:
     """Writes a trained model for sharing: weights, configuration as YAML, and calibration if there is one.
 
+    ``hf upload OWNER/NAME FOLDER`` puts the folder on the Hub.
+
     Args:
         ckpt: a run's folder or checkpoint.
         folder: output folder, created if needed.
@@ -67,31 +69,6 @@ def save_pretrained(ckpt: str | Path, folder: str | Path) -> Path:
         write_bytes(folder / CALIBRATION, known.read_bytes())
     write_text(folder / CONFIG, str(read_checkpoint(checkpoint)[MADE_OF]))
     return folder
-
-
-def push_to_hub(ckpt: str | Path, repo: str, folder: str | Path, private: bool = False) -> str:
-    """Saves a model into a folder and uploads it.
-
-    Args:
-        ckpt: a run's folder or checkpoint.
-        repo: ``OWNER/NAME``; created if needed, with the account of ``hf auth login``.
-        folder: local folder for :func:`save_pretrained`.
-        private: whether to make a new repository private.
-
-    Returns:
-        The URL of the commit.
-
-    Raises:
-        ImportError: if huggingface_hub is not installed.
-    """
-    try:
-        from huggingface_hub import HfApi  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise ImportError("push_to_hub needs huggingface_hub: pip install 'vg2gt[hub]'") from error
-    saved = save_pretrained(ckpt, folder)
-    api = HfApi()
-    api.create_repo(repo, private=private, exist_ok=True)
-    return str(api.upload_folder(repo_id=repo, folder_path=str(saved), allow_patterns=[WEIGHTS, CONFIG, CALIBRATION]))
 
 
 def _weights(name: str | Path, revision: str | None) -> Path:
