@@ -1,14 +1,17 @@
 """The ablation study at the size of a test: a full model of two steps, continuations of one."""
 
 import json
+import math
 import re
 import shlex
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from scipy import stats
 
 import vg2gt.studies.ablation
 import vg2gt.studies.study
@@ -18,7 +21,7 @@ from vg2gt.config import compose
 from vg2gt.evaluation.tables import METRICS
 from vg2gt.runs.checkpoints import newest, read_checkpoint
 from vg2gt.studies.ablation import CONTROL, FULL, Ablation, _verdict, common_overrides, continuations
-from vg2gt.studies.study import paired_difference
+from vg2gt.studies.study import estimate, over_seeds, paired_difference
 
 QUIET = [override for override in SMALL if not override.startswith("trainer.max_steps")]
 
@@ -209,3 +212,23 @@ def test_numbers_are_checked_first(tmp_path: Path, cache: Path) -> None:
     for name, value in (("seeds", 0), ("seeds", "abc"), ("steps", 1.5), ("full_steps", -1)):
         with pytest.raises(ValueError, match=f"{name}=.*: a study takes whole numbers from [01] on"):
             study(tmp_path, cache, **{name: value})
+
+
+def test_estimate_is_the_textbook_interval() -> None:
+    values = [0.31, 0.28, 0.35, 0.30]
+    found = estimate(values)
+    low, high = stats.t.interval(0.95, 3, np.mean(values), stats.sem(values))
+    assert found.mean == pytest.approx(np.mean(values))
+    assert found.mean - found.margin == pytest.approx(low)
+    assert found.mean + found.margin == pytest.approx(high)
+
+
+def test_differences_are_taken_seed_by_seed() -> None:
+    """What seeds share cancels: a small difference shows although the seeds lie far apart."""
+    full = {0: {"psnr": 20.0}, 1: {"psnr": 30.0}, 2: {"psnr": 25.0}, 7: {"psnr": 1.0}}
+    variant = {2: {"psnr": 24.5}, 0: {"psnr": 19.4}, 1: {"psnr": 29.6}}
+    change = paired_difference(variant, full, "psnr")
+    assert change.mean == pytest.approx(-0.5)
+    assert change.margin < 0.3
+    assert over_seeds(variant, "psnr").margin > 10
+    assert math.isnan(paired_difference(variant, full, "lpips").mean)

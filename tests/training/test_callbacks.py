@@ -9,6 +9,7 @@ from typing import Any
 
 import lightning
 import pytest
+from lightning.pytorch.callbacks import LambdaCallback
 
 from tests.reliability.crash_harness import RUN
 from tests.training_helpers import small_config
@@ -73,6 +74,17 @@ def test_a_signal_saves_without_another_evaluation(tmp_path: Path, cache: Path, 
     run.trainer.fit(run.module, datamodule=run.datamodule)
     assert (newest(tmp_path / "checkpoints").name, stopped.evaluations) == ("step-3.ckpt", 0)
     assert signal.getsignal(number) == before
+
+
+def test_a_signal_ends_an_evaluation_at_once(tmp_path: Path, cache: Path) -> None:
+    """Lightning's own handler would only record it."""
+    run, handlers = build(small_config(tmp_path, cache, *RUN)), []
+    note = LambdaCallback(on_validation_batch_start=lambda *_: handlers.append(signal.getsignal(signal.SIGTERM)))
+    run.trainer.callbacks.append(note)  # pyright: ignore[reportAttributeAccessIssue]
+    before = signal.getsignal(signal.SIGTERM)
+    run.trainer.validate(run.module, datamodule=run.datamodule, verbose=False)
+    signal.signal(signal.SIGTERM, before)
+    assert handlers == [signal.SIG_DFL]
 
 
 def test_a_killed_process_that_loads_data_is_one_error(tmp_path: Path, cache: Path) -> None:

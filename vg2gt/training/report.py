@@ -30,6 +30,7 @@ ROWS = columns(
     },
 )
 HEAD = ("", "untrained", "trained", "change")
+PREVIEWED = 3  # maximum number of scenes in the preview
 CAPTION = "views never trained on, at ground-truth poses; depth aligned by one median scale per scene"
 
 
@@ -50,14 +51,13 @@ def comparison_table(untrained: dict[str, float], trained: dict[str, float]) -> 
 
 
 @torch.no_grad()
-def write_preview(module: VG2GTModule, datamodule: LightningDataModule, path: str | Path, scenes: int = 3) -> Path:
+def write_preview(module: VG2GTModule, datamodule: LightningDataModule, path: str | Path) -> Path:
     """Writes one row per scene: an input, then the middle held-out view's rendered colour, depth, normals, and truth.
 
     Args:
         module: the trained module.
         datamodule: provides the evaluation scenes.
         path: PNG file to write.
-        scenes: maximum number of scenes.
 
     Returns:
         The path written.
@@ -67,9 +67,9 @@ def write_preview(module: VG2GTModule, datamodule: LightningDataModule, path: st
     for batch in datamodule.val_dataloader():
         for index in range(len(batch.scene)):
             rows.append(_row(module, batch.single(index).to(module.device)))
-        if len(rows) >= scenes:
+        if len(rows) >= PREVIEWED:
             break
-    return write_png(path, grid(rows[:scenes]))
+    return write_png(path, grid(rows[:PREVIEWED]))
 
 
 def _row(module: VG2GTModule, batch: Batch) -> list[torch.Tensor]:
