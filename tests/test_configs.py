@@ -17,8 +17,8 @@ from lightning.pytorch.strategies import DDPStrategy, SingleDeviceStrategy
 from omegaconf import DictConfig, OmegaConf
 from typing_extensions import get_type_hints
 
-from tests.training_helpers import full_model
-from vg2gt.config import compose, config_dir, group_options
+from tests.training_helpers import full_model, group_options
+from vg2gt.config import compose, config_dir
 from vg2gt.geometry.precision import trainer_precision
 from vg2gt.losses import VG2GTLoss
 from vg2gt.refinement import RefineOptions

@@ -13,9 +13,10 @@ import pytest
 
 import vg2gt.cli
 from tests.commands import ROOT
+from tests.training_helpers import group_options
 from vg2gt.cli.arguments import separate
 from vg2gt.cli.commands import COMMANDS, DATA_COMMANDS
-from vg2gt.config import compose, config_dir, group_options
+from vg2gt.config import compose, config_dir
 
 DOCS = sorted((ROOT / "docs").rglob("*.md"))
 PAGES = [

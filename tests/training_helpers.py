@@ -7,7 +7,7 @@ import lightning
 import torch
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from vg2gt.config import compose, compose_groups
+from vg2gt.config import compose, compose_groups, config_dir, plugin_targets
 from vg2gt.model import VG2GT, Reconstructor
 from vg2gt.runs.checkpoints import MADE_OF
 from vg2gt.runs.load import made_of
@@ -38,6 +38,11 @@ NARROW = [
     "model.coarse.ptv3.dec_heads=[2,2,2,2]",
     "model.fine.dense_head.features=16",
 ]
+
+
+def group_options(group: str) -> list[str]:
+    """The options that ``group=`` accepts, sorted."""
+    return sorted({*plugin_targets().get(group, {}), *(path.stem for path in Path(config_dir(), group).glob("*.yaml"))})
 
 
 def small_config(folder: Path, cache: Path, *overrides: str) -> DictConfig:

@@ -57,12 +57,6 @@ def config_dir() -> str:
     )
 
 
-def group_options(group: str) -> list[str]:
-    """Returns the options that ``group=`` accepts, sorted."""
-    plugins = plugin_targets().get(group, {})
-    return sorted({*plugins, *(path.stem for path in Path(config_dir(), group).glob("*.yaml"))})
-
-
 def compose(name: str | None, *overrides: str) -> DictConfig:
     """Composes a configuration as the commands do; also works inside a command.
 

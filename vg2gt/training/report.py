@@ -34,7 +34,8 @@ PREVIEWED = 3  # maximum number of scenes in the preview
 CAPTION = "views never trained on, at ground-truth poses; depth aligned by one median scale per scene"
 
 
-def _rows(untrained: dict[str, float], trained: dict[str, float]) -> list[list[str]]:
+def comparison_table(untrained: dict[str, float], trained: dict[str, float]) -> str:
+    """Returns the table as Markdown."""
     rows = []
     for name, metric in ROWS.items():
         before, after = untrained.get(name, math.nan), trained.get(name, math.nan)
@@ -42,12 +43,7 @@ def _rows(untrained: dict[str, float], trained: dict[str, float]) -> list[list[s
         relative = f" ({change / before:+.0%})" if before and math.isfinite(change) else ""
         shown = [number(before, metric.decimals), number(after, metric.decimals)]
         rows.append([metric.label, *shown, number(change, metric.decimals, sign=True) + relative])
-    return rows
-
-
-def comparison_table(untrained: dict[str, float], trained: dict[str, float]) -> str:
-    """Returns the table as Markdown."""
-    return f"{markdown_table(HEAD, _rows(untrained, trained))}\n\n{CAPTION}.\n"
+    return f"{markdown_table(HEAD, rows)}\n\n{CAPTION}.\n"
 
 
 @torch.no_grad()
