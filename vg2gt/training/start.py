@@ -61,7 +61,7 @@ def checkpoint_to_resume(config: DictConfig) -> Path | None:
             )
         return None
     step, most = read_checkpoint(path)["global_step"], config.trainer.max_steps
-    if old and path.resolve() != newest(folder).resolve():
+    if old and path.resolve() != old[0].resolve():
         raise FileExistsError(
             f"ckpt={path} (step {step}) is not the newest checkpoint of the run in {folder}: resume in a new folder "
             "with name=, or use ckpt=last"
