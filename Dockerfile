@@ -7,7 +7,7 @@ ARG TORCH_INDEX=https://pypi.org/simple
 RUN apt-get update && apt-get install -y --no-install-recommends gcc g++ git && rm -rf /var/lib/apt/lists/*
 RUN pip install --no-cache-dir "torch>=2.6,<=2.13.0" --index-url "$TORCH_INDEX"
 COPY . /src
-RUN pip install --no-cache-dir "/src[colmap,video,hub,view]" && rm -rf /src
+RUN pip install --no-cache-dir "/src[colmap,video,hub]" && rm -rf /src
 ENV VG2GT_CACHE=/cache
 VOLUME /cache
 WORKDIR /data

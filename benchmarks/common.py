@@ -19,7 +19,7 @@ from vg2gt.io.files import write_json
 from vg2gt.profiling import now
 from vg2gt.studies.study import compose_run
 from vg2gt.training.loop import Run, build
-from vg2gt.training.schedule import parameter_groups
+from vg2gt.training.module import parameter_groups
 from vg2gt.types import Batch
 
 RESULTS = Path(__file__).resolve().parent / "results"

@@ -36,13 +36,13 @@ def _digest(value: Any) -> str:
 def _train(*overrides: str) -> Values:
     """A training run: its trained tensors, its metrics and its picture."""
     from vg2gt.config import compose
-    from vg2gt.runs.checkpoints import newest_valid, read_checkpoint
+    from vg2gt.runs.checkpoints import newest, read_checkpoint
     from vg2gt.training.loop import train
 
     with tempfile.TemporaryDirectory() as folder:
         options = ("trainer.accelerator=cpu", "callbacks.progress_bar=null", "trainer.enable_progress_bar=false")
         train(compose("train", f"output_dir={folder}", *options, *overrides))
-        state = read_checkpoint(newest_valid(Path(folder, "checkpoints")))["state_dict"]
+        state = read_checkpoint(newest(Path(folder, "checkpoints")))["state_dict"]
         report = json.loads(Path(folder, "metrics.json").read_text())
         picture = _digest(Path(folder, "preview.png").read_bytes())
     metrics = {f"{when} {name}": value for when in ("untrained", "trained") for name, value in report[when].items()}

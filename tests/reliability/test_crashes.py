@@ -1,6 +1,5 @@
 """Runs killed at any moment go on with the same command and end as the uninterrupted run, bit for bit."""
 
-import shutil
 from pathlib import Path
 
 from tests.reliability import crash_harness as harness
@@ -27,22 +26,3 @@ def test_killed_run_equals_uninterrupted(tmp_path: Path, cache: Path, whole: Pat
     for _ in range(2):
         harness.finish(TRAIN, arguments, folder)
         harness.assert_same(whole, folder)
-
-
-def test_a_damaged_last_checkpoint_is_set_aside(tmp_path: Path, cache: Path, whole: Path) -> None:
-    """The run resumes from the previous one, reports it, and ends with the same weights."""
-    folder = tmp_path / "run"
-    shutil.copytree(whole, folder)
-    newest = folder / "checkpoints" / f"step-{harness.STEPS}.ckpt"
-    content = bytearray(newest.read_bytes())
-    content[len(content) // 2] ^= 1
-    newest.write_bytes(content)
-    (folder / "metrics.json").unlink()
-    harness.finish(TRAIN, harness.training(folder, cache), folder)
-    aside = newest.with_name(f"{newest.name}.damaged")
-    assert aside.read_bytes() == bytes(content)
-    aside.unlink()
-    harness.assert_same(whole, folder)
-    said = folder.with_name("run.out").read_text()
-    assert "trying the previous checkpoint" in said
-    assert "continuing from step-4.ckpt" in said

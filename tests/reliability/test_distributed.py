@@ -156,7 +156,8 @@ def test_a_fault_on_one_rank_drops_the_step_on_both(two) -> None:
     assert first["dropped"] == second["dropped"] == [False, True, False]
     assert torch.equal(first["weights"], second["weights"])
     (fault,) = first["faults"]
-    assert (fault["step"], fault["rank"], fault["cause"]) == (1, 1, "images, depth or cameras of the batch")
+    assert fault.startswith("step 1, rank 1, ")
+    assert fault.endswith(": images, depth or cameras of the batch")
 
 
 def test_evaluation_on_two_ranks_is_that_of_one(two, tmp_path: Path, cache: Path) -> None:

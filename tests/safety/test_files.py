@@ -1,6 +1,5 @@
 """Pictures, headers and names that ask for too much, for other programs, or for files that are not theirs."""
 
-import io
 import json
 import os
 import signal
@@ -21,7 +20,6 @@ from vg2gt.data.sources.parsing import read_numbers
 from vg2gt.io.arrays import load_npz
 from vg2gt.io.cameras_json import NamedCamera
 from vg2gt.io.image_files import image_size, read_color, read_depth
-from vg2gt.io.images import open_image
 from vg2gt.io.tensors import read_tensors
 from vg2gt.runs.checkpoints import read_checkpoint
 from vg2gt.runs.trust import read_run_config
@@ -70,14 +68,6 @@ def test_pictures(tmp_path: Path, canary: Path, name: str) -> None:
     moving.write_bytes(path.read_bytes())
     with pytest.raises(formats.FormatError, match=r"moving\.gif"):
         list(formats.read_video(moving))
-
-
-def test_ordinary_pictures_are_read(tmp_path: Path) -> None:
-    picture = Image.fromarray(np.arange(48, dtype=np.uint8).reshape(4, 4, 3))
-    for kind in ("PNG", "JPEG", "TIFF", "PPM", "WEBP", "BMP", "GIF"):
-        buffer = io.BytesIO()
-        picture.save(buffer, kind)
-        assert open_image(buffer).convert("RGB").size == (4, 4), kind
 
 
 def ply(lines: str) -> bytes:

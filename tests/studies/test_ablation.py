@@ -1,14 +1,17 @@
 """The ablation study at the size of a test: a full model of two steps, continuations of one."""
 
 import json
+import math
 import re
 import shlex
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from scipy import stats
 
 import vg2gt.studies.ablation
 import vg2gt.studies.study
@@ -16,9 +19,9 @@ from tests.commands import printed
 from tests.training_helpers import SMALL
 from vg2gt.config import compose
 from vg2gt.evaluation.tables import METRICS
-from vg2gt.runs.checkpoints import newest_valid, read_checkpoint
+from vg2gt.runs.checkpoints import newest, read_checkpoint
 from vg2gt.studies.ablation import CONTROL, FULL, Ablation, _verdict, common_overrides, continuations
-from vg2gt.studies.study import paired_difference
+from vg2gt.studies.study import estimate, over_seeds, paired_difference
 
 QUIET = [override for override in SMALL if not override.startswith("trainer.max_steps")]
 
@@ -77,13 +80,13 @@ def test_results_and_tables(finished: Path) -> None:
 def test_all_continue_from_the_same_full_model(finished: Path) -> None:
     """The full model trains as long as every variant, and only a new last layer starts from scratch."""
     home = finished / "seed-0"
-    start = read_checkpoint(newest_valid(home / "start" / "checkpoints"))
+    start = read_checkpoint(newest(home / "start" / "checkpoints"))
     assert start["global_step"] == 2
     layer = "model.gaussians.out.weight"
     untrained = json.loads((home / "full" / "untrained.json").read_text())
     assert untrained == json.loads((home / "start" / "metrics.json").read_text())["trained"]
     for name in (FULL, "wo_split", CONTROL):
-        end = read_checkpoint(newest_valid(home / name / "checkpoints"))
+        end = read_checkpoint(newest(home / name / "checkpoints"))
         assert end["global_step"] == 1
         hidden = "model.gaussians.hidden.weight"
         moved = (end["state_dict"][hidden] - start["state_dict"][hidden]).abs().max()
@@ -123,18 +126,9 @@ def test_other_settings_are_refused(finished: Path, cache: Path) -> None:
         study(finished, cache, "loss.enhance.weight=2").run()
 
 
-def test_results_of_another_full_model_are_not_taken(folder: Path, cache: Path) -> None:
-    """The full model's folder was deleted, as the message says, and trained longer: its continuations are stale."""
-    shutil.rmtree(folder / "seed-0" / "start")
-    longer = study(folder, cache, full_steps=3)
-    with pytest.raises(ValueError, match=r"full holds a run with other settings \(the weights in init_from\)"):
-        longer.run()
-    assert longer.results[FULL] == {}
-
-
 def test_a_full_model_whose_end_is_lost_is_refused(folder: Path, cache: Path) -> None:
     """Its last checkpoint is damaged: variants must not go on from an earlier one."""
-    newest_valid(folder / "seed-0" / "start" / "checkpoints").write_bytes(b"damaged")
+    newest(folder / "seed-0" / "start" / "checkpoints").write_bytes(b"damaged")
     with pytest.raises(ValueError, match=r"step-2\.ckpt is damaged"):
         study(folder, cache).run()
 
@@ -184,7 +178,7 @@ def test_verdicts() -> None:
 def test_given_weights_on_a_protocol(finished: Path, tmp_path: Path, cache: Path, monkeypatch) -> None:
     """Without a step of training: every variant of the given weights is scored as ``vg2gt evaluate`` scores it."""
     monkeypatch.setattr(vg2gt.studies.study, "train", lambda config: pytest.fail(f"trained {config.output_dir}"))
-    given = newest_valid(finished / "seed-0" / "start" / "checkpoints")
+    given = newest(finished / "seed-0" / "start" / "checkpoints")
     scenes = ["views=2", "data.image_size=[28,56]", "data.eval_scenes=1", "data.num_frames=8"]
     scenes += [f"data.cache_dir={cache}", "evaluation.selection.index=null"]
     own = {"full_steps": 0, "steps": 0, "splits": "[2]", "init_from": given, "protocol": "synthetic"}
@@ -197,7 +191,7 @@ def test_given_weights_on_a_protocol(finished: Path, tmp_path: Path, cache: Path
         mean = report["views"]["2"]["mean"]
         assert some.results[run][0]["psnr"] == mean["rendered/gt_pose/solid/psnr"]
         assert some.results[run][0]["gaussians"] == mean["scene/gaussians"]
-        weights = read_checkpoint(newest_valid(tmp_path / "seed-0" / run / "checkpoints"))["state_dict"]
+        weights = read_checkpoint(newest(tmp_path / "seed-0" / run / "checkpoints"))["state_dict"]
         kept = read_checkpoint(given)["state_dict"]
         assert torch.equal(weights["model.gaussians.hidden.weight"], kept["model.gaussians.hidden.weight"])
     assert some.results["wo_split"][0]["gaussians"] < 0.7 * some.results[FULL][0]["gaussians"]
@@ -218,3 +212,23 @@ def test_numbers_are_checked_first(tmp_path: Path, cache: Path) -> None:
     for name, value in (("seeds", 0), ("seeds", "abc"), ("steps", 1.5), ("full_steps", -1)):
         with pytest.raises(ValueError, match=f"{name}=.*: a study takes whole numbers from [01] on"):
             study(tmp_path, cache, **{name: value})
+
+
+def test_estimate_is_the_textbook_interval() -> None:
+    values = [0.31, 0.28, 0.35, 0.30]
+    found = estimate(values)
+    low, high = stats.t.interval(0.95, 3, np.mean(values), stats.sem(values))
+    assert found.mean == pytest.approx(np.mean(values))
+    assert found.mean - found.margin == pytest.approx(low)
+    assert found.mean + found.margin == pytest.approx(high)
+
+
+def test_differences_are_taken_seed_by_seed() -> None:
+    """What seeds share cancels: a small difference shows although the seeds lie far apart."""
+    full = {0: {"psnr": 20.0}, 1: {"psnr": 30.0}, 2: {"psnr": 25.0}, 7: {"psnr": 1.0}}
+    variant = {2: {"psnr": 24.5}, 0: {"psnr": 19.4}, 1: {"psnr": 29.6}}
+    change = paired_difference(variant, full, "psnr")
+    assert change.mean == pytest.approx(-0.5)
+    assert change.margin < 0.3
+    assert over_seeds(variant, "psnr").margin > 10
+    assert math.isnan(paired_difference(variant, full, "lpips").mean)

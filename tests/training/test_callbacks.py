@@ -9,10 +9,11 @@ from typing import Any
 
 import lightning
 import pytest
+from lightning.pytorch.callbacks import LambdaCallback
 
 from tests.reliability.crash_harness import RUN
 from tests.training_helpers import small_config
-from vg2gt.runs.checkpoints import newest_valid, read_checkpoint
+from vg2gt.runs.checkpoints import newest, read_checkpoint
 from vg2gt.training.distributed import ending_together
 from vg2gt.training.loop import build, train
 
@@ -55,7 +56,7 @@ def test_the_best_by_a_metric_is_kept(tmp_path: Path, cache: Path) -> None:
     assert len(during) == 3
     best = read_checkpoint(tmp_path / "checkpoints" / "best.ckpt")
     assert best["global_step"] == 1 + list(during.values()).index(max(during.values()))
-    assert newest_valid(tmp_path / "checkpoints").name == "step-3.ckpt"
+    assert newest(tmp_path / "checkpoints").name == "step-3.ckpt"
 
 
 def rows(folder: Path) -> list[dict[str, str]]:
@@ -71,8 +72,19 @@ def test_a_signal_saves_without_another_evaluation(tmp_path: Path, cache: Path, 
     run = build(small_config(tmp_path, cache, *RUN))
     run.trainer.callbacks.append(stopped)  # pyright: ignore[reportAttributeAccessIssue]
     run.trainer.fit(run.module, datamodule=run.datamodule)
-    assert (newest_valid(tmp_path / "checkpoints").name, stopped.evaluations) == ("step-3.ckpt", 0)
+    assert (newest(tmp_path / "checkpoints").name, stopped.evaluations) == ("step-3.ckpt", 0)
     assert signal.getsignal(number) == before
+
+
+def test_a_signal_ends_an_evaluation_at_once(tmp_path: Path, cache: Path) -> None:
+    """Lightning's own handler would only record it."""
+    run, handlers = build(small_config(tmp_path, cache, *RUN)), []
+    note = LambdaCallback(on_validation_batch_start=lambda *_: handlers.append(signal.getsignal(signal.SIGTERM)))
+    run.trainer.callbacks.append(note)  # pyright: ignore[reportAttributeAccessIssue]
+    before = signal.getsignal(signal.SIGTERM)
+    run.trainer.validate(run.module, datamodule=run.datamodule, verbose=False)
+    signal.signal(signal.SIGTERM, before)
+    assert handlers == [signal.SIG_DFL]
 
 
 def test_a_killed_process_that_loads_data_is_one_error(tmp_path: Path, cache: Path) -> None:

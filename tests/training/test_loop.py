@@ -1,13 +1,10 @@
 """Whole runs: every ablation, backends, resume, bad input."""
 
 import json
-import os
 import shlex
 import shutil
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +12,9 @@ import pytest
 import torch
 
 from tests.commands import shell
-from tests.reliability import crash_harness
 from tests.training_helpers import SMALL, full_model, small_config
 from vg2gt.data import DataError, Frames, SyntheticScenes
-from vg2gt.runs.checkpoints import newest_valid, read_checkpoint
+from vg2gt.runs.checkpoints import newest, read_checkpoint
 from vg2gt.runs.lock import only_process_in
 from vg2gt.training.loop import Run, build, evaluate, train
 
@@ -30,14 +26,8 @@ def full_run(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> Path:
     return folder
 
 
-VARIANTS = [
-    *(f"ablation={name}" for name in ("rasterized", "wo_depth", "wo_coarse", "wo_enhance", "wo_split")),
-    "model.gaussians.splits=4",
-    "loss=release",
-    "backend=vggt_tiny",
-    "backend=da3_tiny",
-    "data.max_images=8",
-]
+VARIANTS = [f"ablation={name}" for name in ("rasterized", "wo_coarse", "wo_split")]
+VARIANTS += ["loss=release", "backend=vggt_tiny", "backend=da3_tiny"]
 
 
 @pytest.mark.parametrize("override", VARIANTS)
@@ -66,9 +56,9 @@ def test_a_run_writes_its_results(full_run: Path) -> None:
     assert (metrics["steps"], metrics["untrained"].keys()) == (4, metrics["trained"].keys())
     assert "PSNR" in (full_run / "metrics.md").read_text()
     assert (full_run / "preview.png").stat().st_size > 1000
-    newest = newest_valid(full_run / "checkpoints")
-    assert newest.name == "step-4.ckpt"
-    checkpoint = read_checkpoint(newest)
+    path = newest(full_run / "checkpoints")
+    assert path.name == "step-4.ckpt"
+    checkpoint = read_checkpoint(path)
     assert checkpoint["backend"]["name"] == "oracle"
     assert checkpoint["state_dict"]
     assert not [key for key in checkpoint["state_dict"] if ".backend." in key]  # the trained part only
@@ -83,41 +73,16 @@ def test_only_the_trained_part_changes(tmp_path: Path, cache: Path) -> None:
     assert not run.module.model.backend.training
 
 
-def started(folder: Path, cache: Path, *overrides: str) -> crash_harness.Attempt:
-    """A training in a process of its own."""
-    places = [f"output_dir={folder}", f"hydra.run.dir={folder}", f"data.cache_dir={cache}"]
-    return crash_harness.start(crash_harness.TRAIN, [*SMALL, *places, *overrides], folder)
-
-
-def test_sigterm_saves_and_ends(tmp_path: Path, cache: Path) -> None:
-    folder = tmp_path / "run"
-    endless = ["trainer.max_steps=100000", "callbacks.checkpoint.every_n_train_steps=100000"]
-    attempt = started(folder, cache, *endless)
-    assert attempt.wait_for(lambda attempt: "train/" in attempt.log())
-    os.kill(attempt.process.pid, signal.SIGTERM)
-    assert attempt.wait() == 0, attempt.said()[-2000:]
-    assert read_checkpoint(newest_valid(folder / "checkpoints"))["global_step"] >= 1
-    assert "resume with ckpt=last" in attempt.said()
-
-
-def test_sigterm_ends_an_evaluation_at_once(tmp_path: Path, cache: Path) -> None:
-    attempt = started(tmp_path / "run", cache, "data.eval_scenes=1000")
-    assert attempt.wait_for(lambda attempt: "compil" in attempt.said() or "evaluating the untrained" in attempt.said())
-    time.sleep(5)
-    os.kill(attempt.process.pid, signal.SIGTERM)
-    assert attempt.wait() == -signal.SIGTERM
-
-
 def test_a_run_never_restarts_silently(full_run: Path, cache: Path, tmp_path: Path) -> None:
     with pytest.raises(FileExistsError, match="ckpt=last"):
         train(small_config(full_run, cache))
-    with pytest.raises(FileNotFoundError, match="no valid checkpoint"):
+    with pytest.raises(FileNotFoundError, match="no checkpoint in"):
         train(small_config(tmp_path, cache, "ckpt=last"))
     with pytest.raises(FileNotFoundError, match="nowhere"):
         train(small_config(tmp_path, cache, "ckpt=nowhere.ckpt"))
     (tmp_path / "checkpoints").mkdir()
     (tmp_path / "checkpoints" / "step-2.ckpt").write_bytes(b"damaged")
-    with pytest.raises(FileNotFoundError, match="no valid checkpoint in"):
+    with pytest.raises(ValueError, match=r"step-2\.ckpt is damaged"):
         train(small_config(tmp_path, cache, "ckpt=auto"))
     assert (tmp_path / "checkpoints" / "step-2.ckpt").read_bytes() == b"damaged"
 
@@ -151,10 +116,8 @@ REFUSED: list[tuple[list[str], str | None]] = [
             "loss.geometry=null": r"loss\.geometry=null does not turn anything off",
             "loss.geometry.quantile=0": "greater than 0 and at most 1",
             "training.render_views=0": r"training\.render_views=0.*at least 1, or null for all",
-            "trainer.val_check_interval=0": r"trainer\.val_check_interval=0: give a large number",
             "+trainer.accumulate_grad_batches=2": "accumulate",
             "+trainer.gradient_clip_algorithm=value": "use norm",
-            "init_from=.": r"init_from=\.: no valid checkpoint in",
             "init_from=nowhere.ckpt": r"init_from=nowhere\.ckpt: no such checkpoint or run",
         }.items()
     ),
@@ -201,7 +164,7 @@ def test_a_resumed_run_names_what_changed(copied: Path, cache: Path, caplog) -> 
 
 
 def test_wo_split_starts_from_a_full_model(full_run: Path, cache: Path, tmp_path: Path, caplog) -> None:
-    checkpoint = newest_valid(full_run / "checkpoints")
+    checkpoint = newest(full_run / "checkpoints")
     config = small_config(tmp_path, cache, "ablation=wo_split", f"init_from={checkpoint}", "trainer.max_steps=1")
     assert train(config)["steps"] == 1
     fresh = next(record.getMessage() for record in caplog.records if "re-initialised" in record.getMessage())
@@ -252,7 +215,7 @@ def test_posed_photographs_without_depth_are_trained_on(tmp_path: Path, cache: P
 
 
 @pytest.mark.parametrize("name", ["tensorboard", "wandb"])
-def test_other_loggers_get_curves_and_the_picture(name, tmp_path, cache, monkeypatch, capsys):
+def test_other_loggers_get_curves(name, tmp_path, cache, monkeypatch, capsys):
     pytest.importorskip(name)
     monkeypatch.setenv("WANDB_MODE", "offline")
     monkeypatch.setenv("WANDB_SILENT", "true")
@@ -261,7 +224,6 @@ def test_other_loggers_get_curves_and_the_picture(name, tmp_path, cache, monkeyp
     written = [path for pattern in ("*.tfevents.*", "run-*.wandb") for path in tmp_path.rglob(pattern)]
     content = b"".join(path.read_bytes() for path in written if not path.is_symlink())
     assert b"train/grad_norm" in content
-    assert b"preview" in content
 
 
 @pytest.mark.slow

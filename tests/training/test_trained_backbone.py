@@ -7,7 +7,7 @@ import torch
 from hydra.utils import instantiate
 
 from tests.training_helpers import small_config
-from vg2gt.runs.checkpoints import newest_valid, read_checkpoint
+from vg2gt.runs.checkpoints import newest, read_checkpoint
 from vg2gt.runs.load import load_model
 from vg2gt.training.loop import build, train
 
@@ -32,7 +32,7 @@ def test_gradients_reach_all_but_the_cameras(tmp_path: Path, cache: Path, backen
 def test_a_checkpoint_holds_a_trained_backbone(tmp_path: Path, cache: Path) -> None:
     given = ["backend=da3_tiny", "trainer.max_steps=2", "training.warmup_steps=0"]
     trained = train(small_config(tmp_path / "first", cache, *given, UNFROZEN, "training.backend_lr_factor=0.5"))
-    path = newest_valid(tmp_path / "first" / "checkpoints")
+    path = newest(tmp_path / "first" / "checkpoints")
     stored = read_checkpoint(path)["state_dict"]
     weight = "backend.network.backbone.pretrained.blocks.0.attn.qkv.weight"
     fresh = build(small_config(tmp_path / "fresh", cache, *given)).module.model
@@ -44,5 +44,5 @@ def test_a_checkpoint_holds_a_trained_backbone(tmp_path: Path, cache: Path) -> N
     assert weight in loaded.trained_state()
     again = train(small_config(tmp_path / "frozen", cache, *given, f"init_from={path}"))
     assert again["untrained"] == trained["trained"]
-    kept = read_checkpoint(newest_valid(tmp_path / "frozen" / "checkpoints"))["state_dict"]
+    kept = read_checkpoint(newest(tmp_path / "frozen" / "checkpoints"))["state_dict"]
     assert not any(name.startswith("model.backend.") for name in kept)

@@ -11,7 +11,6 @@ from tests.io.gaussian_scenes import scene, views
 from tests.viewer.reading import read_viewer_html
 from vg2gt.cli import view
 from vg2gt.io import named_cameras, write_cameras_json, write_gaussian_ply, write_spz
-from vg2gt.viewer import server
 
 
 @pytest.fixture
@@ -30,73 +29,57 @@ def run(*arguments: Path | str) -> None:
 
 
 @pytest.mark.parametrize("name", ["scene.ply", "scene.spz"])
-def test_page_of_a_file(files: Path, capsys: pytest.CaptureFixture, name: str) -> None:
-    run(files / name, "--cameras", files / "cameras.json", "--html", files / "out" / "page.html")
-    assert len(read_viewer_html(files / "out" / "page.html")) == 60
+def test_page_of_a_file(files: Path, capsys: pytest.CaptureFixture, monkeypatch, name: str) -> None:
+    opened: list[str] = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    run(files / name)
+    page = files / "scene.html"
+    assert len(read_viewer_html(page)) == 60
+    assert f"<title>{name}</title>" in page.read_text()
+    assert page.read_text().count('"picture": "') == 2
     printed = capsys.readouterr().out
-    assert "2 of 3 cameras have their image" in printed
-    assert "60 Gaussians" in printed
-    page = (files / "out" / "page.html").read_text()
-    assert f"<title>{name}</title>" in page
-    assert page.count('"picture": "') == 2
-
-
-def test_images_in_the_folder_that_reconstruct_writes(files: Path, capsys: pytest.CaptureFixture) -> None:
-    (files / "images").mkdir()
-    for index in range(2):
-        (files / f"{index}.png").rename(files / "images" / f"{index}.png")
-    arguments = (files / "scene.ply", "--cameras", files / "cameras.json", "--html", files / "page.html")
-    run(*arguments)
-    assert f"2 of 3 cameras have their image in {files / 'images'}" in capsys.readouterr().out
-    assert (files / "page.html").read_text().count('"picture": "') == 2
-    run(*arguments, "--images", files)
+    assert f"2 of 3 cameras have their image in {files}" in printed
+    assert f"{page}: 60 Gaussians" in printed
+    elsewhere = files / "out" / "page.html"
+    run(files / name, "--html", elsewhere, "--cameras", files / "cameras.json", "--images", files / "none", "--open")
     assert "photographs are not shown: none in" in capsys.readouterr().out
+    assert opened == [elsewhere.as_uri()]
 
 
-def test_what_reconstruct_writes_is_found_by_itself(files: Path, capsys: pytest.CaptureFixture) -> None:
+def test_images_that_reconstruct_writes_are_found(files: Path, capsys: pytest.CaptureFixture) -> None:
     for index in range(2):
         (files / f"{index}.png").unlink()
-    write = {"images": np.full((3, 400, 560, 3), 100, np.uint8)}
-    np.savez(files / "views.npz", **write)
-    run(files / "scene.ply", "--html", files / "page.html")
-    assert f"3 of 3 cameras have their image in {files / 'views.npz'}" in capsys.readouterr().out
-    assert (files / "page.html").read_text().count('"picture": "') == 3
-    np.savez(files / "views.npz", **write, names=np.array(["0", "1", "3"]))  # left by another run
-    run(files / "scene.ply", "--html", files / "page.html")
-    assert "photographs are not shown: none in" in capsys.readouterr().out
-    np.savez(files / "views.npz", images=write["images"][:2])
-    run(files / "scene.ply", "--html", files / "page.html")
-    assert "photographs are not shown: none in" in capsys.readouterr().out
+    images = np.full((3, 400, 560, 3), 100, np.uint8)
+    for names, found in (("012", 3), ("019", 2)):
+        np.savez(files / "views.npz", images=images, names=np.array(list(names)))
+        run(files / "scene.ply")
+        assert f"{found} of 3 cameras have their image in {files / 'views.npz'}" in capsys.readouterr().out
     (files / "views.npz").write_bytes(b"nonsense")
     with pytest.raises(SystemExit, match=r"cannot read .*views\.npz"):
-        run(files / "scene.ply", "--html", files / "page.html")
+        run(files / "scene.ply")
 
 
 def test_cameras_of_3d_gaussian_splatting(files: Path) -> None:
     camera = {"id": 0, "img_name": "0", "width": 56, "height": 40, "fx": 50.0, "fy": 50.0}
     camera |= {"position": [0.0, 0.0, -2.0], "rotation": np.eye(3).tolist()}
     (files / "cameras.json").write_text(json.dumps([camera]))
-    run(files / "scene.ply", "--html", files / "page.html")
-    assert len(read_viewer_html(files / "page.html")) == 60
+    run(files / "scene.ply")
+    assert len(read_viewer_html(files / "scene.html")) == 60
 
 
 def test_mistakes_end_with_one_line(files: Path, capsys: pytest.CaptureFixture) -> None:
     write_gaussian_ply(files / "empty.ply", scene(0))
     (files / "broken.ply").write_bytes(b"ply\nnonsense")
     (files / "0.png").write_bytes(b"nonsense")
-    html, ply = ("--html", files / "page.html"), files / "scene.ply"
-    elsewhere = files / "alone" / "scene.ply"
+    ply = files / "scene.ply"
     cases: list[tuple[tuple[Path | str, ...], str]] = [
-        ((files / "absent.ply", *html), "absent.ply"),
-        ((files / "cameras.json", *html), "expected a scene of Gaussians, .ply"),
-        ((files / "broken.ply", *html), "broken.ply"),
-        ((files / "empty.ply", *html), "empty.ply holds no Gaussians"),
-        ((ply, *html, "--port", "9000"), "omit --host, --port and --share"),
-        ((ply, *html, "--share"), "omit --host, --port and --share"),
-        ((elsewhere, *html, "--images", files), "--images requires --cameras"),
-        ((ply, *html, "--cameras", ply), "scene.ply: not valid JSON"),
-        ((ply, *html, "--cameras", files / "cameras.json"), "0.png"),
-        ((ply, "--port", "70000"), "--port"),
+        ((files / "absent.ply",), "absent.ply"),
+        ((files / "cameras.json",), "expected a scene of Gaussians, .ply"),
+        ((files / "broken.ply",), "broken.ply"),
+        ((files / "empty.ply",), "empty.ply holds no Gaussians"),
+        ((files / "alone" / "scene.ply", "--images", files), "--images requires --cameras"),
+        ((ply, "--cameras", ply), "scene.ply: not valid JSON"),
+        ((ply, "--cameras", files / "cameras.json"), "0.png"),
     ]
     for arguments, message in cases:
         with pytest.raises(SystemExit) as ended:
@@ -106,10 +89,4 @@ def test_mistakes_end_with_one_line(files: Path, capsys: pytest.CaptureFixture) 
         assert said.startswith("vg2gt view: error: ") == flags == ("--" in message)
         assert message in said
         assert "\n" not in said
-    assert not (files / "page.html").exists()
-
-
-def test_without_viser_the_extra_is_named(files: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(server.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(SystemExit, match=r"pip install 'vg2gt\[view\]'"):
-        run(files / "scene.ply")
+    assert not (files / "scene.html").exists()

@@ -11,13 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import hydra
-from hydra.errors import ConfigCompositionException
 from omegaconf import DictConfig
 
 from vg2gt.cli import folders
 from vg2gt.cli.commands import COMMANDS, DATA_COMMANDS
 from vg2gt.cli.errors import errors_in_one_line
-from vg2gt.config import config_dir, near_keys
+from vg2gt.config import config_dir
 
 folders.register()
 
@@ -42,13 +41,8 @@ def hydra_command(name: str) -> Callable[[Callable[[DictConfig], None]], Callabl
             """Composes the configuration with Hydra, which also reports wrong arguments, and runs the job."""
             if {"-h", "--help"} & set(sys.argv):
                 print(f"{command.does}\n\nexample: {command.example}\n")
-            try:
-                with errors_in_one_line():
-                    hydra.main(version_base="1.3", config_path=config_dir(), config_name=name)(job)()
-            except SystemExit as ended:
-                if isinstance(ended.__context__, ConfigCompositionException):
-                    print(near_keys(name, sys.argv[1:]), end="", file=sys.stderr)
-                raise
+            with errors_in_one_line():
+                hydra.main(version_base="1.3", config_path=config_dir(), config_name=name)(job)()
 
         return main
 

@@ -43,8 +43,8 @@ COMMANDS = {
         "vg2gt render scene.ply --cameras cameras.json --save color.png --out views",
     ),
     "view": Command(
-        "shows a scene in the browser, live or as one page",
-        "vg2gt view scene.ply --cameras cameras.json --html scene.html",
+        "writes a scene as one page for the browser",
+        "vg2gt view scene.ply --cameras cameras.json --open",
     ),
     "export": Command(
         "writes a frozen network as an ONNX bundle", "vg2gt export backend=da3_small --out bundles/da3_small"

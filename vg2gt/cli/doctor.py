@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.metadata
 import os
 import platform
-import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,6 +17,7 @@ if TYPE_CHECKING:
     import torch
 
 NEEDED = ("torch", "lightning", "numba", "numpy")
+OPTIONAL = ("triton", "pycolmap", "av", "lzfse", "huggingface_hub", "onnx", "onnxscript", "tensorboard", "wandb")
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -32,7 +32,7 @@ def findings() -> Iterator[tuple[str, str]]:
     """Yields what is checked and the result."""
     yield "vg2gt", f"{vg2gt.__version__} ({vg2gt.source()}), Python {platform.python_version()}, {platform.platform()}"
     yield "packages", ", ".join(f"{name} {_version(name)}" for name in NEEDED)
-    yield from _optional()
+    yield "optional", ", ".join(f"{name} {_version(name)}" for name in OPTIONAL)
     yield from _folders()
     import torch
 
@@ -52,18 +52,6 @@ def _version(package: str) -> str:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
         return "missing"
-
-
-def _optional() -> Iterator[tuple[str, str]]:
-    """Versions of the optional packages by extra, except those for tests."""
-    extras: dict[str, list[str]] = {}
-    for line in importlib.metadata.requires("vg2gt") or [] if _version("vg2gt") != "missing" else []:
-        name = re.match(r"[\w.-]+", line)
-        extra = re.search(r"extra == ['\"](\w+)['\"]", line)
-        if name and extra and extra[1] != "test":
-            extras.setdefault(extra[1], []).append(name[0])
-    for extra, names in {**extras, "gpu": ["triton", "gsplat"]}.items():
-        yield f"[{extra}]", ", ".join(f"{name} {_version(name)}" for name in names)
 
 
 def _folders() -> Iterator[tuple[str, str]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from functools import lru_cache
-from pathlib import Path, PureWindowsPath
+from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -12,7 +12,7 @@ FIRST = "quickstart"
 NAMING = {"data": "synthetic", "backend": "oracle", "model": "tiny"}  # a run with these defaults is named FIRST
 ADDED = ("experiment", "ablation")
 STARTED_BY_OTHERS = ("LOCAL_RANK", "RANK", "SLURM_PROCID")
-OF_A_RUN = ("config.yaml", "checkpoints", ".lock")
+OF_A_RUN = ("config.yaml", "checkpoints", ".lock", "[0-9]*")  # the last: jobs of a sweep
 
 
 def register() -> None:
@@ -53,20 +53,15 @@ def chosen(choices: DictConfig) -> str:
 def free(name: str) -> str:
     """Returns ``name``, or the first ``name-N`` without a run; cached, so it is the same for all jobs of a sweep."""
     number, candidate = 1, name
-    while any((Path("outputs", candidate) / part).exists() for part in OF_A_RUN) or _holds_jobs(candidate):
+    while any(path for part in OF_A_RUN for path in Path("outputs", candidate).glob(part)):
         number += 1
         candidate = f"{name}-{number}"
     return candidate
 
 
-def _holds_jobs(name: str) -> bool:
-    """Whether the folder holds jobs of a sweep, whose folders are numbers."""
-    return any(path.name.isdecimal() for path in Path("outputs", name).glob("[0-9]*"))
-
-
 def inside(name: str) -> str:
     """Returns ``name``; ValueError if it points outside its parent folder."""
-    parts = PureWindowsPath(name).parts  # splits at both kinds of slashes
-    if not parts or PureWindowsPath(name).drive or name.startswith(("/", "\\")) or ".." in parts:
+    path = Path(name)
+    if not path.parts or path.is_absolute() or ".." in path.parts:
         raise ValueError(f"name={name} must be a path inside outputs, such as mine or paper/first")
     return name

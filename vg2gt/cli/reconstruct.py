@@ -43,8 +43,8 @@ if TYPE_CHECKING:
     from vg2gt.runs.load import LoadedModel
 
 
-def parser() -> argparse.ArgumentParser:
-    """The command's arguments."""
+def main(argv: Sequence[str] | None = None) -> None:
+    """Runs the command; errors are reported in one line."""
     arguments = flag_parser("reconstruct", OVERRIDES + listing(OUTPUTS))
     add = arguments.add_argument
     add("images", nargs="+", help="image files, a folder of them, a video, or a recording with known cameras")
@@ -66,21 +66,9 @@ def parser() -> argparse.ArgumentParser:
     add("--drop", type=list_of_names, default=[], metavar="LIST", help="drop Gaussians by status, a list of: guessed, "
         "contradicted, single (seen by one view), unseen")  # fmt: skip
     add_common_flags(arguments, DEFAULT)
-    return arguments
-
-
-def main(argv: Sequence[str] | None = None) -> None:
-    """Runs the command; errors are reported in one line."""
-    from rich.console import Console
-    from rich.logging import RichHandler
-
     given, overrides = separate(argv)
-    options = parser().parse_args(given)
-    logging.basicConfig(
-        level=logging.WARNING,
-        format="%(message)s",
-        handlers=[RichHandler(console=Console(stderr=True), show_time=False, show_path=False)],
-    )
+    options = arguments.parse_args(given)
+    logging.basicConfig(level=logging.WARNING, format="%(message)s")
     with errors_in_one_line():
         run(options, overrides)
 

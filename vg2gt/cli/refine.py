@@ -7,7 +7,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from vg2gt.cli.arguments import add_common_flags, flag_parser, listing, separate
 from vg2gt.cli.errors import errors_in_one_line
@@ -21,8 +21,8 @@ HOW = "\nrefine=NAME (see configs/refine) and refine.key=value set the options; 
 ADVICE = "fewer or smaller images (vg2gt reconstruct --max-images, --size) or fewer Gaussians"
 
 
-def parser() -> argparse.ArgumentParser:
-    """The command's arguments."""
+def main(argv: Sequence[str] | None = None) -> None:
+    """Runs the command; errors are reported in one line."""
     arguments = flag_parser("refine", HOW + listing(OUTPUTS))
     add = arguments.add_argument
     add("scene", metavar="DIR", help="a folder that vg2gt reconstruct has written")
@@ -31,13 +31,8 @@ def parser() -> argparse.ArgumentParser:
     add("--seconds", type=float, metavar="S", help="stop after S seconds, or after --steps if that comes first")
     add("--holdout", type=int, metavar="N", help="exclude every N-th view and print its PSNR before and after")
     add_common_flags(arguments, DEFAULT)
-    return arguments
-
-
-def main(argv: Sequence[str] | None = None) -> None:
-    """Runs the command; errors are reported in one line."""
     given, overrides = separate(argv)
-    options = parser().parse_args(given)
+    options = arguments.parse_args(given)
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     with errors_in_one_line():
         run(options, overrides)
@@ -61,24 +56,18 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     with Monitor(show=not options.quiet, device=device) as monitor, memory_advice(ADVICE):
         with monitor.stage("read scene"):
             scene = read_scene(options.scene, Renderer(mode=options.mode), device)
-        how = options_for(scene, overrides, options.steps, options.seconds, options.holdout)
+        how = options_for(scene, overrides, steps=options.steps, seconds=options.seconds, holdout=options.holdout)
         scene = refine_scene(scene, how, monitor)
         folder = write_outputs(scene, out, options.save, overwrite=options.overwrite, monitor=monitor)
     print(*refinement_lines(scene), sep="\n")
     print(f"written: {', '.join(str(folder / name) for name in (*options.save, REFINED))}")
 
 
-def options_for(
-    scene: Scene,
-    overrides: Sequence[str] = (),
-    steps: int | None = None,
-    seconds: float | None = None,
-    holdout: int | None = None,
-) -> RefineOptions:
+def options_for(scene: Scene, overrides: Sequence[str] = (), **changes: float | None) -> RefineOptions:
     """Returns the refinement options of a scene.
 
-    The defaults depend on the scene's cameras; ``overrides`` change them, then the other arguments. Predicted cameras
-    are refined unless there are overrides.
+    The defaults depend on the scene's cameras; ``overrides`` change them, then ``changes`` that are not None. Seconds
+    alone replace the default steps. Predicted cameras are refined unless there are overrides.
     """
     from vg2gt.reconstruction.refined import refinement_of
     from vg2gt.refinement import RefineRates
@@ -86,9 +75,8 @@ def options_for(
     found = refine_options(refinement_of(scene), overrides)
     if not overrides and not scene.cameras_from:
         found = replace(found, rates=replace(found.rates, cameras=RefineRates().cameras))
-    if seconds is not None or steps is not None:
-        found = replace(found, steps=steps, seconds=found.seconds if seconds is None else seconds)
-    return found if holdout is None else replace(found, holdout=holdout)
+    given: dict[str, Any] = {name: value for name, value in changes.items() if value is not None}
+    return replace(found, **({"steps": None} if "seconds" in given else {}) | given)
 
 
 def refine_options(name: str, overrides: Sequence[str]) -> RefineOptions:

@@ -13,8 +13,8 @@ OUTPUTS = {**MAPS, "video.gif": "the colour of all views as an animation", "vide
 DEFAULT = ("color.png",)
 
 
-def parser() -> argparse.ArgumentParser:
-    """The command's arguments."""
+def main(argv: Sequence[str] | None = None) -> None:
+    """Runs the command; errors are reported in one line."""
     arguments = flag_parser("render", listing(OUTPUTS))
     add = arguments.add_argument
     add("scene", help="scene.ply or .spz")
@@ -30,12 +30,7 @@ def parser() -> argparse.ArgumentParser:
     add("--fps", type=float, default=FPS, help=f"frame rate of the animation, default {FPS:g}")
     add("--near", type=float, default=0.01, help="near plane in scene units")
     add_common_flags(arguments, DEFAULT)
-    return arguments
-
-
-def main(argv: Sequence[str] | None = None) -> None:
-    """Runs the command; errors are reported in one line."""
-    options = parser().parse_args(argv)
+    options = arguments.parse_args(argv)
     with errors_in_one_line():
         run(options)
 

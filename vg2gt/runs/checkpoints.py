@@ -19,6 +19,7 @@ from vg2gt.io.files import replacing, write_bytes
 log = logging.getLogger(__name__)
 
 PATTERN = "step-*.ckpt"
+DAMAGED = "is damaged or not a checkpoint of this project (delete it to resume from the one before)"
 SLIM = ".safetensors"  # a checkpoint without training state
 MADE_OF = "config"  # key of the configuration of backend, model and renderer, as YAML
 MODEL_PREFIX = "model."  # prefix of the model's names in a checkpoint's state_dict, from the Lightning module
@@ -60,7 +61,7 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
         if not isinstance(content, dict):
             raise ValueError(f"it holds a {type(content).__name__}")
     except Exception as error:  # damaged bytes make readers raise almost anything
-        raise ValueError(f"checkpoint {path} is damaged or not a checkpoint of this project: {error}") from error
+        raise ValueError(f"{path} {DAMAGED}: {error}") from error
     return content
 
 
@@ -102,7 +103,7 @@ def _read_slim(path: Path) -> dict[str, Any]:
             MADE_OF: header[MADE_OF],
         }
     except (SafetensorError, OSError, KeyError, ValueError) as error:
-        raise ValueError(f"checkpoint {path} is damaged or not a checkpoint of this project: {error}") from error
+        raise ValueError(f"{path} {DAMAGED}: {error}") from error
     return {"state_dict": state, **facts}
 
 
@@ -118,29 +119,20 @@ def refuse_not_finite(state: Mapping[str, Tensor], path: str | Path) -> None:
         raise ValueError(f"checkpoint {path} has non-finite weights ({bad}): use an earlier checkpoint of its run")
 
 
-def newest_valid(folder: str | Path) -> Path:
-    """Returns the newest readable checkpoint in a folder, logging damaged ones.
+def newest(folder: str | Path) -> Path:
+    """Returns the newest checkpoint in a folder.
 
     Raises:
         FileNotFoundError: if there is none.
     """
-    folder = Path(folder)
-    candidates = by_age(folder)
-    for path in candidates:
-        try:
-            read_checkpoint(path)
-        except (ValueError, FileNotFoundError) as error:  # FileNotFoundError: a folder of that name
-            log.warning("%s; trying the previous checkpoint", error)
-        else:
-            return path
-    raise FileNotFoundError(
-        f"no valid checkpoint in {folder} ({len(candidates)} damaged): name a file with ckpt=PATH, or start from the "
-        "beginning with ckpt=null overwrite=true (ckpt=auto does so only without any checkpoint)"
-    )
+    found = by_age(Path(folder))
+    if not found:
+        raise FileNotFoundError(f"no checkpoint in {folder}: name one with ckpt=PATH, or start anew with ckpt=null")
+    return found[0]
 
 
 def by_age(folder: Path) -> list[Path]:
-    """Returns the checkpoints in a folder, valid or not, newest first."""
+    """Returns the checkpoints in a folder, newest first."""
     return sorted(folder.glob(PATTERN), key=lambda path: (_step_of(path), path.name), reverse=True)
 
 
@@ -172,26 +164,20 @@ def initialize_from(module: nn.Module, path: str | Path) -> None:
 
 
 def checkpoint_path(ckpt: str | Path | None, option: str = "ckpt") -> Path | None:
-    """Returns ``ckpt`` if it is a file, or the newest valid checkpoint of a run's folder; None for None.
+    """Returns ``ckpt`` if it is a file, or the newest checkpoint of a run's folder; None for None.
 
     Raises:
-        FileNotFoundError: if there is no such file or folder, or the folder has no valid checkpoint; names ``option``.
+        FileNotFoundError: if there is no such file, or no checkpoint in the folder; names ``option``.
     """
-    if ckpt is None:
-        return None
-    path = Path(ckpt)
-    if path.is_file():
-        return path
-    folder, found = path / "checkpoints" if (path / "checkpoints").is_dir() else path, "no such checkpoint or run"
-    if path.is_dir():
-        try:
-            return newest_valid(folder)
-        except FileNotFoundError:
-            found = f"no valid checkpoint in {folder}"
-    raise FileNotFoundError(
-        f"{option}={ckpt}: {found}; give a run's folder such as outputs/quickstart, a checkpoint's file, or null for "
-        "none (the untrained head)"
-    )
+    if ckpt is None or Path(ckpt).is_file():
+        return None if ckpt is None else Path(ckpt)
+    found = [*by_age(Path(ckpt, "checkpoints")), *by_age(Path(ckpt))]
+    if not found:
+        raise FileNotFoundError(
+            f"{option}={ckpt}: no such checkpoint or run; give a run's folder such as outputs/quickstart, a "
+            "checkpoint's file, or null for none (the untrained head)"
+        )
+    return found[0]
 
 
 def run_config_path(checkpoint: Path) -> Path:

@@ -25,9 +25,8 @@ from vg2gt.runs.checkpoints import (
     model_state,
     read_checkpoint,
     refuse_not_finite,
-    run_config_path,
 )
-from vg2gt.runs.trust import check_targets, parse_run_config, read_run_config
+from vg2gt.runs.trust import check_targets, parse_run_config
 from vg2gt.uncertainty import Calibration, read_calibration
 
 log = logging.getLogger(__name__)
@@ -98,7 +97,7 @@ def load_model(
         seed: seed of the untrained head.
 
     Raises:
-        FileNotFoundError: if there is no such checkpoint, or its run's ``config.yaml`` or a weight file is missing.
+        FileNotFoundError: if there is no such checkpoint, or a weight file is missing.
         ValueError: if a name or an option is unknown, or the checkpoint belongs to another backbone.
     """
     checkpoint, parts = model_parts(ckpt, [*([f"backend={backend}"] if backend else []), *overrides])
@@ -156,14 +155,13 @@ def backend_class(ckpt: str | Path | None, overrides: Sequence[str]) -> type:
 
 
 def resolve_parts(config: DictConfig, checkpoint: Path | None) -> dict[str, DictConfig]:
-    """Returns the configurations of backend, model and renderer: those of the run, with the overrides in ``config``.
+    """Returns the configurations of backend, model and renderer: the checkpoint's, with the overrides in ``config``.
 
     ``model=tiny`` replaces the run's model; ``+model.fine.max_voxels=100000`` changes one key of it. Without a
     checkpoint, the training defaults are used.
 
     Raises:
-        FileNotFoundError: if the run's ``config.yaml`` is needed and missing.
-        ValueError: if it lacks a part, or differs from what the checkpoint was trained with.
+        ValueError: if the checkpoint stores no configuration, or another one decides its tokens.
         UntrustedError: if it holds an interpolation or a target that is not allowed (:mod:`vg2gt.runs.trust`).
     """
     given: dict[str, Any] = {part: config.get(part) for part in PARTS}
@@ -209,36 +207,13 @@ def made_of(config: DictConfig) -> str:
 
 
 def _config_of(checkpoint: Path, parts: Sequence[str]) -> DictConfig:
-    """Configuration of a checkpoint's run: ``config.yaml``, which must agree with the checkpoint, else its own copy."""
-    path = run_config_path(checkpoint)
-    text = read_checkpoint(checkpoint).get(MADE_OF)  # missing in old checkpoints
-    known = parse_run_config(text, f"{checkpoint}: {MADE_OF}") if isinstance(text, str) else None
-    if path.is_file():
-        run, source = read_run_config(path), path
-    elif known is not None:
-        run, source = known, checkpoint
-    else:
-        raise FileNotFoundError(
-            f"{path} is missing: it records the model, backend and renderer of the checkpoint; restore it, or set "
-            "model=, backend= and renderer="
-        )
+    """The configuration that a checkpoint stores, with the targets in ``parts`` checked."""
+    text = read_checkpoint(checkpoint).get(MADE_OF)
+    if not isinstance(text, str):
+        raise ValueError(f"{checkpoint} stores no configuration: set model=, backend= and renderer=")
+    run = parse_run_config(text, f"{checkpoint}: {MADE_OF}")
     for part in parts:
-        if run.get(part) is None:
-            raise ValueError(f"{source} has no {part}, so it is not a run's configuration; set {part}=")
-        check_targets(run[part], f"{source}: {part}")
-    if known is not None:
-        plain = (OmegaConf.to_container(config) for config in (run, known))
-        here, there = (flatten({part: each.get(part) for part in parts}) for each in plain)  # pyright: ignore
-        different = [
-            f"{key} is {here.get(key)} in the file, {there.get(key)} in the checkpoint"
-            for key in sorted(here.keys() | there.keys())
-            if here.get(key) != there.get(key) and key.rpartition(".")[2] not in FREE
-        ]
-        if different:
-            raise ValueError(
-                f"{path} does not match {checkpoint}: {'; '.join(different)}. Correct it, or delete it: the checkpoint "
-                "stores its own configuration"
-            )
+        check_targets(run[part], f"{checkpoint}: {MADE_OF}.{part}")
     return run
 
 

@@ -104,7 +104,8 @@ def check_targets(config: Any, source: str | Path) -> None:
         home = str(getattr(found, "__module__", None))
         if home.partition(".")[0] != package:
             raise UntrustedError(f"{said}, which is defined in {home}, not in {package} ({ENVIRONMENT}=PACKAGE)")
-        if package in OWN and not _is_ours_to_build(found):
+        bases = found.__mro__ if isinstance(found, type) else ()
+        if package in OWN and not any(base in KINDS or base.__name__ == "LightningDataModule" for base in bases):
             raise UntrustedError(f"{said}, which is not a model, backend, renderer or dataset ({ENVIRONMENT}=PACKAGE)")
 
 
@@ -118,8 +119,3 @@ def _targets(node: Any, key: str) -> Iterator[tuple[str, Any]]:
     elif isinstance(node, Sequence) and not isinstance(node, str):
         for place, child in enumerate(node):
             yield from _targets(child, f"{key}{place}.")
-
-
-def _is_ours_to_build(found: Any) -> bool:
-    data_module = isinstance(found, type) and any(kind.__name__ == "LightningDataModule" for kind in found.__mro__)
-    return data_module or (isinstance(found, type) and issubclass(found, KINDS))

@@ -17,7 +17,6 @@ from scipy.stats import t as student
 from vg2gt.config import compose, flatten
 from vg2gt.evaluation.tables import Metric, markdown_table, number
 from vg2gt.io.files import read_json, write_json, write_text
-from vg2gt.io.tensors import tensors_digest
 from vg2gt.runs.checkpoints import read_checkpoint, write_checkpoint
 from vg2gt.runs.trust import read_run_config
 from vg2gt.training.loop import build, evaluate, train
@@ -27,7 +26,6 @@ log = logging.getLogger(__name__)
 
 Metrics = dict[str, float]
 INTERRUPTED = 143
-START = "start.json"
 # Settings that must be equal for two runs to be the same; folders and logging may differ.
 COMPARED = ("backend", "model", "data", "loss", "renderer", "optimizer", "training", "seed")
 COMPARED_KEYS = ("trainer.max_steps", "trainer.precision", "trainer.gradient_clip_val")
@@ -48,7 +46,7 @@ def run_once(overrides: Sequence[str], folder: Path, scored: bool = True) -> Met
         scored: whether a run of 0 steps is evaluated, which needs its data.
 
     Raises:
-        ValueError: if the folder holds the run of another configuration, or one that started from other weights.
+        ValueError: if the folder holds the run of another configuration.
         SystemExit: if the training was asked to stop (SIGTERM); the same call resumes it.
     """
     config = compose_run(overrides, folder)
@@ -82,27 +80,21 @@ def _without_steps(config: DictConfig, folder: Path, scored: bool) -> dict[str, 
 
 
 def _refuse_other_run(config: DictConfig, folder: Path) -> None:
-    """Raises ValueError if the folder's run has other settings or initial weights; a new run's weights are noted."""
-    path, start = folder / "config.yaml", folder / START
-    other: list[str] = []
-    if path.is_file():
-        before, now = (flatten(OmegaConf.to_container(c, resolve=True)) for c in (read_run_config(path), config))
-        other = [
-            key
-            for key in sorted(before.keys() | now.keys())
-            if (key.split(".")[0] in COMPARED or key in COMPARED_KEYS) and key not in NOT_COMPARED
-            if before.get(key) != now.get(key)
-        ]
-    if config.get("init_from"):
-        weights = {"weights": tensors_digest(read_checkpoint(config.init_from)["state_dict"])}
-        if start.is_file():
-            other += [] if read_json(start) == weights else ["the weights in init_from"]
-        elif not path.is_file():
-            write_json(start, weights)
+    """Raises ValueError if the folder holds a run with other settings."""
+    path = folder / "config.yaml"
+    if not path.is_file():
+        return
+    before, now = (flatten(OmegaConf.to_container(c, resolve=True)) for c in (read_run_config(path), config))
+    other = [
+        key
+        for key in sorted(before.keys() | now.keys())
+        if (key.split(".")[0] in COMPARED or key in COMPARED_KEYS) and key not in NOT_COMPARED
+        if before.get(key) != now.get(key)
+    ]
     if other:
         raise ValueError(
             f"{folder} holds a run with other settings ({', '.join(other)}): choose another name=, repeat the "
-            "settings, or delete the folder"
+            "settings, or delete the whole study"
         )
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
 from typing import Any, TypeVar
 
 import lightning
@@ -23,9 +22,8 @@ KEPT = 20  # maximum number of faults in the report of a run
 
 def world_size() -> int:
     """Returns the number of processes in the process group; 1 without one."""
-    if not torch.distributed.is_available() or not torch.distributed.is_initialized():
-        return 1
-    return torch.distributed.get_world_size()
+    there = torch.distributed.is_available() and torch.distributed.is_initialized()
+    return torch.distributed.get_world_size() if there else 1
 
 
 def all_gather_object(value: Value) -> list[Value]:
@@ -57,26 +55,6 @@ def ending_together(trainer: lightning.Trainer) -> Iterator[None]:
         raise
 
 
-@dataclass(frozen=True)
-class Fault:
-    """Non-finite values that a rank found in a step.
-
-    Attributes:
-        scenes: scenes of the rank's batch.
-        cause: what is not finite.
-        step: step number.
-        rank: rank that found it.
-    """
-
-    scenes: list[str]
-    cause: str
-    step: int
-    rank: int
-
-    def __str__(self) -> str:
-        return f"rank {self.rank}, {', '.join(self.scenes)}: {self.cause}"
-
-
 def finite(*tensors: Tensor) -> bool:
     """Returns whether all values are finite; synchronises with the GPU only once if they are."""
     sums = torch.stack([tensor.detach().sum().float() for tensor in tensors])  # a non-finite value makes the sum so
@@ -92,7 +70,7 @@ class SkippedSteps:
     Attributes:
         total: steps skipped since the run began.
         in_a_row: steps skipped since the last good step.
-        faults: first faults of the run, at most :data:`KEPT`.
+        faults: what was not finite in the first of them: step, rank, scenes and cause; at most :data:`KEPT`.
     """
 
     def __init__(self, limit: int) -> None:
@@ -101,24 +79,23 @@ class SkippedSteps:
         self.limit = limit
         self.total = 0
         self.in_a_row = 0
-        self.faults: list[Fault] = []
+        self.faults: list[str] = []
 
-    def add(self, faults: list[Fault]) -> None:
+    def add(self, faults: list[str]) -> None:
         """Counts a skipped step; raises FloatingPointError at ``limit`` in a row."""
         self.total += 1
         self.in_a_row += 1
         self.faults = (self.faults + faults)[:KEPT]
         if self.in_a_row >= self.limit:
             raise FloatingPointError(
-                f"{self.in_a_row} steps in a row had a non-finite loss or gradient, the last: "
-                f"{'; '.join(map(str, faults))}. Check its scenes, lower optimizer.lr, or raise training.max_skipped"
+                f"{self.in_a_row} steps in a row had a non-finite loss or gradient, the last: {'; '.join(faults)}. "
+                "Check its scenes, lower optimizer.lr, or raise training.max_skipped"
             )
 
     def state_dict(self) -> dict[str, Any]:
         """Returns plain values, for checkpoints and the report of a run."""
-        return {"total": self.total, "in_a_row": self.in_a_row, "faults": [asdict(fault) for fault in self.faults]}
+        return {"total": self.total, "in_a_row": self.in_a_row, "faults": self.faults}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores the counts from a checkpoint."""
-        self.total, self.in_a_row = state["total"], state["in_a_row"]
-        self.faults = [Fault(**fault) for fault in state["faults"]]
+        self.total, self.in_a_row, self.faults = state["total"], state["in_a_row"], state["faults"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import logging
 import math
 import os
@@ -19,7 +18,6 @@ from hydra.utils import instantiate
 from lightning.fabric.utilities.rank_zero import rank_zero_only
 from lightning.pytorch import LightningDataModule, Trainer
 from lightning.pytorch.callbacks import ProgressBar
-from lightning.pytorch.loggers import TensorBoardLogger, WandbLogger
 from omegaconf import DictConfig
 
 from backends.cache import TokenCache
@@ -28,9 +26,8 @@ from vg2gt.evaluation.checks import refuse_without_hints
 from vg2gt.evaluation.pictures import PANELS
 from vg2gt.geometry.precision import trainer_precision
 from vg2gt.io.files import read_json, write_json, write_text
-from vg2gt.io.image_files import read_color
 from vg2gt.memory import TRAINING, memory_advice
-from vg2gt.runs.checkpoints import newest_valid
+from vg2gt.runs.checkpoints import newest
 from vg2gt.runs.load import made_of
 from vg2gt.runs.lock import only_process_in
 from vg2gt.training.checkpointing import AtomicCheckpointIO
@@ -82,7 +79,6 @@ class Run:
 def build(config: DictConfig) -> Run:
     """Instantiates the module, data and trainer of a configuration; each constructor is the schema of its section."""
     _check(config)
-    _check_loggers(config)
     lightning.seed_everything(config.seed, workers=True, verbose=False)
     accelerator = _accelerator(config.trainer.accelerator)
     if accelerator == "gpu":
@@ -114,14 +110,6 @@ def build(config: DictConfig) -> Run:
         default_root_dir=config.output_dir,
     )
     return Run(module, datamodule, trainer, Path(config.output_dir))
-
-
-def _check_loggers(config: DictConfig) -> None:
-    """Raises ImportError if a logger's package is missing, naming the extra that installs it."""
-    chosen = [str(logger._target_) for logger in config.logger.values() if logger]
-    for ending, package in (("TensorBoardLogger", "tensorboard"), ("WandbLogger", "wandb")):
-        if any(target.endswith(ending) for target in chosen) and importlib.util.find_spec(package) is None:
-            raise ImportError(f"logger={package} needs {package}: pip install 'vg2gt[log]'")
 
 
 def _quieten_lightning() -> None:
@@ -175,8 +163,6 @@ def _check(config: DictConfig) -> None:
         raise ValueError(
             f"trainer.gradient_clip_algorithm={trainer.gradient_clip_algorithm} is not supported; use norm"
         )
-    if trainer.get("val_check_interval") == 0:
-        raise ValueError("trainer.val_check_interval=0: give a large number for no evaluation during training")
     for section, value in config.loss.items():
         if value is None and str(config.loss.get("_target_")).endswith(".VG2GTLoss"):  # the defaults of its class
             raise ValueError(f"loss.{section}=null does not turn anything off: set the weights in loss.{section} to 0")
@@ -195,7 +181,7 @@ def train(config: DictConfig) -> dict[str, Any]:
     Raises:
         BlockingIOError: if another process uses the folder.
         FileExistsError: if the folder holds a run and neither ``ckpt`` nor ``overwrite`` says what to do with it.
-        FileNotFoundError: if ``ckpt`` names no valid checkpoint.
+        FileNotFoundError: if ``ckpt`` names no checkpoint.
         ValueError: if the model has no trained part, or the checkpoint is beyond ``trainer.max_steps``.
         OutOfMemory: if device memory runs out; names the sizes and the options that reduce them.
     """
@@ -282,20 +268,8 @@ def report(run: Run, untrained: dict[str, float], trained: dict[str, float]) -> 
         print(table)
         run.module.to(run.trainer.strategy.root_device)  # the strategy's teardown moved it to the CPU
         preview = write_preview(run.module, run.datamodule, run.folder / "preview.png")
-        _log_picture(run, preview)
         print(f"preview ({PANELS}): {preview}")
-        print(f"checkpoint: {newest_valid(run.folder / 'checkpoints')}")
+        print(f"checkpoint: {newest(run.folder / 'checkpoints')}")
         print(f"metrics: {run.folder / 'metrics.json'}")
         print(f"curves: {', '.join(str(logger.log_dir or logger.save_dir) for logger in run.trainer.loggers)}")
     return content
-
-
-def _log_picture(run: Run, picture: Path) -> None:
-    """Logs the preview to TensorBoard and Weights & Biases."""
-    for logger in run.trainer.loggers:
-        if isinstance(logger, TensorBoardLogger):
-            pixels = torch.from_numpy(read_color(picture, run.folder.name))
-            logger.experiment.add_image("preview", pixels, run.trainer.global_step, dataformats="HWC")
-            logger.experiment.flush()  # training has ended, so nothing else flushes it
-        elif isinstance(logger, WandbLogger):
-            logger.log_image("preview", [str(picture)], run.trainer.global_step)

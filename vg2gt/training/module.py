@@ -23,8 +23,7 @@ from vg2gt.model import VG2GT, Reconstructor
 from vg2gt.profiling import stage
 from vg2gt.rendering import Renderer, UnrenderableError
 from vg2gt.runs.checkpoints import MADE_OF, MODEL_PREFIX, model_state
-from vg2gt.training.distributed import Fault, SkippedSteps, all_gather_object, finite, world_size
-from vg2gt.training.schedule import cosine_with_warmup, parameter_groups
+from vg2gt.training.distributed import SkippedSteps, all_gather_object, finite, world_size
 from vg2gt.types import Batch, Prediction
 
 log = logging.getLogger(__name__)
@@ -214,8 +213,7 @@ class VG2GTModule(lightning.LightningModule):
         gradient_clip_algorithm: str | None = None,
     ) -> None:
         """Clips the global gradient norm; skips the step on all ranks if a loss or gradient is non-finite on any."""
-        limit = float(gradient_clip_val) if gradient_clip_val and gradient_clip_val > 0 else float("inf")
-        norm = nn.utils.clip_grad_norm_(self.model.trained_parameters(), limit)
+        norm = nn.utils.clip_grad_norm_(self.model.trained_parameters(), gradient_clip_val or math.inf)
         bad = torch.ones_like(norm) if self._cause is not None else (~norm.isfinite()).to(norm.dtype)
         # All ranks see the same sum, so either all skip the step or none does. The host waits here.
         bad_ranks = float(self.trainer.strategy.reduce(bad, reduce_op="sum"))
@@ -232,10 +230,12 @@ class VG2GTModule(lightning.LightningModule):
     def _skip_step(self) -> None:
         """Counts a skipped step and logs the fault of each rank."""
         cause = self._cause or "gradient"  # averaged, so non-finite on all ranks
-        found = all_gather_object(Fault(list(self._scenes), cause, self.global_step, self.global_rank))
-        faults = [fault for fault in found if fault.cause != "gradient"] or found
+        found = all_gather_object(
+            f"step {self.global_step}, rank {self.global_rank}, {', '.join(self._scenes)}: {cause}"
+        )
+        faults = [fault for fault in found if not fault.endswith(": gradient")] or found
         if self.trainer.is_global_zero:
-            log.warning("skipped step %d with non-finite values: %s", self.global_step, "; ".join(map(str, faults)))
+            log.warning("skipped a step with non-finite values: %s", "; ".join(faults))
         self.skipped.add(faults)
 
     def configure_optimizers(self) -> dict[str, Any]:
@@ -300,3 +300,53 @@ def _leave_only_coarse(model: Reconstructor) -> None:
         )
     for name, parameter in model.named_parameters():
         parameter.requires_grad_(parameter.requires_grad and name.startswith("coarse."))
+
+
+def cosine_with_warmup(steps: int, warmup_steps: int, final_factor: float) -> Callable[[int], float]:
+    """Returns a function from step to learning-rate factor: linear warm-up to 1, then cosine decay.
+
+    Args:
+        steps: total number of steps.
+        warmup_steps: steps of linear warm-up.
+        final_factor: factor at ``steps`` and after.
+    """
+
+    def factor(step: int) -> float:
+        if step < warmup_steps:
+            return (step + 1) / (warmup_steps + 1)
+        progress = min(1.0, (step - warmup_steps) / max(1, steps - warmup_steps))
+        return final_factor + (1 - final_factor) * 0.5 * (1 + math.cos(math.pi * progress))
+
+    return factor
+
+
+def parameter_groups(module: nn.Module, factors: Mapping[str, float] | None = None) -> list[dict[str, Any]]:
+    """Splits the trainable parameters into optimiser groups; vectors (biases, norms, gains) get no weight decay.
+
+    Args:
+        module: module whose parameters to split.
+        factors: learning-rate factor by name of the direct child module. Children with a factor other than 1 get groups
+            of their own, with the factor as ``lr_factor``.
+
+    Returns:
+        Groups with named parameters as ``params``.
+    """
+    apart = {name: factor for name, factor in (factors or {}).items() if factor != 1}
+    groups = []
+    for child in ("", *apart):
+        for decays in (True, False):
+            parameters = [
+                (name, parameter)
+                for name, parameter in module.named_parameters()
+                if parameter.requires_grad and (parameter.dim() > 1) is decays and _child(name, apart) == child
+            ]
+            if parameters:
+                options = ({} if decays else {"weight_decay": 0.0}) | ({"lr_factor": apart[child]} if child else {})
+                groups.append({"params": parameters, **options})
+    return groups
+
+
+def _child(name: str, apart: Mapping[str, float]) -> str:
+    """The child module of a parameter's name if it is one of ``apart``, else an empty string."""
+    child = name.partition(".")[0]
+    return child if child in apart else ""

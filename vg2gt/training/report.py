@@ -30,10 +30,12 @@ ROWS = columns(
     },
 )
 HEAD = ("", "untrained", "trained", "change")
+PREVIEWED = 3  # maximum number of scenes in the preview
 CAPTION = "views never trained on, at ground-truth poses; depth aligned by one median scale per scene"
 
 
-def _rows(untrained: dict[str, float], trained: dict[str, float]) -> list[list[str]]:
+def comparison_table(untrained: dict[str, float], trained: dict[str, float]) -> str:
+    """Returns the table as Markdown."""
     rows = []
     for name, metric in ROWS.items():
         before, after = untrained.get(name, math.nan), trained.get(name, math.nan)
@@ -41,23 +43,17 @@ def _rows(untrained: dict[str, float], trained: dict[str, float]) -> list[list[s
         relative = f" ({change / before:+.0%})" if before and math.isfinite(change) else ""
         shown = [number(before, metric.decimals), number(after, metric.decimals)]
         rows.append([metric.label, *shown, number(change, metric.decimals, sign=True) + relative])
-    return rows
-
-
-def comparison_table(untrained: dict[str, float], trained: dict[str, float]) -> str:
-    """Returns the table as Markdown."""
-    return f"{markdown_table(HEAD, _rows(untrained, trained))}\n\n{CAPTION}.\n"
+    return f"{markdown_table(HEAD, rows)}\n\n{CAPTION}.\n"
 
 
 @torch.no_grad()
-def write_preview(module: VG2GTModule, datamodule: LightningDataModule, path: str | Path, scenes: int = 3) -> Path:
+def write_preview(module: VG2GTModule, datamodule: LightningDataModule, path: str | Path) -> Path:
     """Writes one row per scene: an input, then the middle held-out view's rendered colour, depth, normals, and truth.
 
     Args:
         module: the trained module.
         datamodule: provides the evaluation scenes.
         path: PNG file to write.
-        scenes: maximum number of scenes.
 
     Returns:
         The path written.
@@ -67,9 +63,9 @@ def write_preview(module: VG2GTModule, datamodule: LightningDataModule, path: st
     for batch in datamodule.val_dataloader():
         for index in range(len(batch.scene)):
             rows.append(_row(module, batch.single(index).to(module.device)))
-        if len(rows) >= scenes:
+        if len(rows) >= PREVIEWED:
             break
-    return write_png(path, grid(rows[:scenes]))
+    return write_png(path, grid(rows[:PREVIEWED]))
 
 
 def _row(module: VG2GTModule, batch: Batch) -> list[torch.Tensor]:

@@ -16,7 +16,7 @@ from vg2gt.runs.checkpoints import (
     checkpoint_path,
     initialize_from,
     model_state,
-    newest_valid,
+    newest,
     read_checkpoint,
     refuse_not_finite,
     run_config_path,
@@ -41,13 +41,13 @@ def checkpoint_to_resume(config: DictConfig) -> Path | None:
 
     Raises:
         FileExistsError: if the folder holds another run.
-        FileNotFoundError: if ``ckpt`` names no valid checkpoint.
+        FileNotFoundError: if ``ckpt`` names no checkpoint.
         ValueError: if the checkpoint's step is beyond ``trainer.max_steps``.
     """
     folder = Path(config.output_dir) / "checkpoints"
-    old = sorted(folder.glob("*.ckpt"))
+    old = by_age(folder)
     if config.ckpt == "last" or (config.ckpt == "auto" and old):
-        path = newest_valid(folder)
+        path = newest(folder)
     elif config.ckpt == "auto":
         log.info("ckpt=auto: no checkpoint in %s yet, the run starts from the beginning", folder)
         return None
@@ -61,7 +61,7 @@ def checkpoint_to_resume(config: DictConfig) -> Path | None:
             )
         return None
     step, most = read_checkpoint(path)["global_step"], config.trainer.max_steps
-    if old and not (path.resolve().parent == folder.resolve() and path.name == newest_valid(folder).name):
+    if old and path.resolve() != old[0].resolve():
         raise FileExistsError(
             f"ckpt={path} (step {step}) is not the newest checkpoint of the run in {folder}: resume in a new folder "
             "with name=, or use ckpt=last"
@@ -78,7 +78,7 @@ def load_start(module: VG2GTModule, config: DictConfig, checkpoint: Path | None)
     """Loads the initial weights: those of ``checkpoint``, else of ``init_from``, else none. Writes nothing.
 
     Raises:
-        FileNotFoundError: if ``init_from`` names no valid checkpoint or run.
+        FileNotFoundError: if ``init_from`` names no checkpoint or run.
         ValueError: if they are not finite or belong to another model, backbone or optimiser.
     """
     if checkpoint is not None:
@@ -92,15 +92,15 @@ def load_start(module: VG2GTModule, config: DictConfig, checkpoint: Path | None)
 
 
 def prepare_folder(config: DictConfig, checkpoint: Path | None) -> None:
-    """Removes half-written files and an overwritten run, renames damaged checkpoints, writes ``config.yaml``.
+    """Removes half-written files and an overwritten run, and writes ``config.yaml``.
 
     A resumed run keeps its earlier ``config.yaml`` as ``config-1.yaml`` and so on if its training data or initial
     weights differ, so that an evaluation knows all scenes that it was trained on.
     """
     folder = Path(config.output_dir)
     current = folder / "config.yaml"
-    kept = earlier_configs(current)
-    if checkpoint is None or not _in_place(config, checkpoint):
+    kept, old = earlier_configs(current), by_age(folder / "checkpoints")
+    if checkpoint is None or checkpoint.resolve().parent != (folder / "checkpoints").resolve():
         for path in kept:  # of a run that was replaced
             path.unlink()
     elif current.is_file() and _origin(read_run_config(current)) != _origin(config):
@@ -108,22 +108,12 @@ def prepare_folder(config: DictConfig, checkpoint: Path | None) -> None:
         write_text(current.with_name(f"config-{number}.yaml"), current.read_text(encoding="utf-8"))
     for path in [*folder.glob(".*.tmp"), *(folder / "checkpoints").glob("*.tmp")]:
         path.unlink()
-    old = by_age(folder / "checkpoints")
-    if checkpoint is not None:
-        for path in old[: next((i for i, path in enumerate(old) if path.name == checkpoint.name), 0)]:
-            path.rename(f"{path}.damaged")
-            log.warning("%s is damaged and was renamed to *.damaged; continuing from %s", path, checkpoint.name)
-    elif old:
-        for path in [*old, folder / "checkpoints" / "best.ckpt"]:
-            path.unlink(missing_ok=True)
+    if checkpoint is None and old:
+        for path in (folder / "checkpoints").glob("*.ckpt"):
+            path.unlink()
         shutil.rmtree(folder / "logs", ignore_errors=True)
         (folder / "metrics.json").unlink(missing_ok=True)
     write_text(current, OmegaConf.to_yaml(config, resolve=True))
-
-
-def _in_place(config: DictConfig, checkpoint: Path) -> bool:
-    """Whether a checkpoint is one of the run's own."""
-    return checkpoint.resolve().parent == (Path(config.output_dir) / "checkpoints").resolve()
 
 
 def _origin(config: DictConfig) -> dict[str, Any]:

@@ -1,12 +1,6 @@
-"""Viewers of a scene: a self-contained HTML page, or a viser server."""
+"""The viewer of a scene: one self-contained HTML page."""
 
 from vg2gt.viewer.content import ViewerScene, load_pictures
 from vg2gt.viewer.page import write_viewer_html
-from vg2gt.viewer.server import start_server
 
-__all__ = [
-    "ViewerScene",
-    "load_pictures",
-    "start_server",
-    "write_viewer_html",
-]
+__all__ = ["ViewerScene", "load_pictures", "write_viewer_html"]

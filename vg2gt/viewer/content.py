@@ -1,9 +1,9 @@
-"""Content of the viewers: Gaussians, cameras, thumbnails of their images, and the initial view."""
+"""Content of the page: Gaussians, cameras, thumbnails of their images, and the initial view."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -32,27 +32,12 @@ class ViewerScene:
         cameras: the cameras to draw; the first is the initial view.
         pictures: ``[H, W, 3]`` uint8 or None, one per camera; empty: no pictures.
         title: title of the page.
-
-    Raises:
-        ValueError: if there are no Gaussians, or the numbers of pictures and cameras differ.
     """
 
     gaussians: Gaussians
     cameras: Sequence[NamedCamera] = ()
-    pictures: Sequence[NDArray[np.uint8] | None] = field(default=())
+    pictures: Sequence[NDArray[np.uint8] | None] = ()
     title: str = "scene"
-
-    def __post_init__(self) -> None:
-        if not len(self.gaussians):
-            raise ValueError("there are no Gaussians to show")
-        if self.pictures and len(self.pictures) != len(self.cameras):
-            raise ValueError(
-                f"expected a picture (or None) per camera, got {len(self.pictures)} for {len(self.cameras)}"
-            )
-
-    def picture(self, index: int) -> NDArray[np.uint8] | None:
-        """Returns the picture of a camera, or None."""
-        return self.pictures[index] if self.pictures else None
 
     def initial(self) -> NamedCamera:
         """Returns the initial view: the first camera, else :func:`default_camera`."""
@@ -78,62 +63,57 @@ def default_camera(gaussians: Gaussians) -> NamedCamera:
     inside = (means[:, 2] > 0) & (means[:, :2].abs() < reach * means[:, 2:]).all(-1)
     pose = np.eye(4)
     if inside.double().mean() < _INSIDE_SHARE:
-        xyz = means.numpy()
-        low, high = np.quantile(xyz, [0.05, 0.95], axis=0)
+        low, high = np.quantile(means.numpy(), [0.05, 0.95], axis=0)
         radius = max(float(np.linalg.norm(high - low)) / 2, 1e-3)
         pose[:3, 3] = -(low + high) / 2 + [0, 0, radius / float(reach.min())]
     return NamedCamera("default", width, height, intrinsics, pose)
 
 
-def load_pictures(cameras: Sequence[NamedCamera], folder: str | Path) -> list[NDArray[np.uint8] | None]:
-    """Loads upright thumbnails of the cameras' images, ``folder / name`` each.
+def load_pictures(cameras: Sequence[NamedCamera], source: str | Path) -> list[NDArray[np.uint8] | None]:
+    """Loads upright thumbnails of the cameras' images.
+
+    Args:
+        cameras: the cameras, named by their images.
+        source: the folder of the images, or a ``views.npz`` of the same scene.
 
     Returns:
-        One per camera, the longer side at most ``PICTURE_SIDE`` pixels; None if the folder has no such file (names that
-        lead out of it count as missing).
+        One per camera, the longer side at most ``PICTURE_SIDE`` pixels; None if ``source`` has no such image (names
+        that lead out of the folder count as missing).
 
     Raises:
         ValueError: if an existing file cannot be read; the message names it.
     """
-    root = Path(folder).resolve()
+    root = Path(source).resolve()
+    if root.suffix == ".npz":
+        return _pictures_of_views(cameras, root)
     pictures: list[NDArray[np.uint8] | None] = []
     for camera in cameras:
-        path = None if "\0" in camera.name else (root / camera.name).resolve()
-        inside = path is not None and path.is_relative_to(root) and path.is_file()
-        pictures.append(_small_picture(path) if path is not None and inside else None)
+        path = (root / camera.name).resolve()
+        pictures.append(_picture(path) if path.is_relative_to(root) and path.is_file() else None)
     return pictures
 
 
-def load_view_pictures(cameras: Sequence[NamedCamera], path: Path) -> list[NDArray[np.uint8] | None]:
-    """Loads thumbnails of the cameras' images from a ``views.npz`` of the same scene.
-
-    Returns:
-        One per camera; empty if there is no such file or it is of other images.
-
-    Raises:
-        ValueError: if the file cannot be read; the message names it.
-    """
+def _pictures_of_views(cameras: Sequence[NamedCamera], path: Path) -> list[NDArray[np.uint8] | None]:
     if not path.is_file():
-        return []
+        return [None] * len(cameras)
     try:
-        names = read_npz(path, [], ["names"]).get("names")
-        if names is not None and names.tolist() != [camera.name.removesuffix(".png") for camera in cameras]:
-            return []
-        pictures = [Image.fromarray(image) for image in read_npz(path, ["images"])["images"]]
+        stored = read_npz(path, ["names", "images"])
+        images = dict(zip(stored["names"].tolist(), stored["images"], strict=True))
+        found = [images.get(camera.name.removesuffix(".png")) for camera in cameras]
+        return [None if image is None else _thumbnail(Image.fromarray(image)) for image in found]
     except Exception as error:  # damaged archives and arrays that are no images
         raise ValueError(f"cannot read {path}: {error}; restore or remove it") from error
-    for picture in pictures:
-        picture.thumbnail((PICTURE_SIDE, PICTURE_SIDE))
-    return [np.array(picture) for picture in pictures] if len(pictures) == len(cameras) else []
 
 
-def _small_picture(path: Path) -> NDArray[np.uint8]:
+def _picture(path: Path) -> NDArray[np.uint8]:
     try:
         with open_image(path) as image:
-            if not image.mode.startswith(("I", "F")):
-                image.thumbnail((PICTURE_SIDE, PICTURE_SIDE))
-            picture = color_image(ImageOps.exif_transpose(image) or image)
-            picture.thumbnail((PICTURE_SIDE, PICTURE_SIDE))
-            return np.array(picture)
+            image.draft("RGB", (2 * PICTURE_SIDE, 2 * PICTURE_SIDE))  # JPEG decodes to a smaller size
+            return _thumbnail(color_image(ImageOps.exif_transpose(image) or image))
     except Exception as error:  # image libraries raise many kinds of errors
         raise ValueError(f"cannot read {path}: {error}; restore or remove the image") from error
+
+
+def _thumbnail(image: Image.Image) -> NDArray[np.uint8]:
+    image.thumbnail((PICTURE_SIDE, PICTURE_SIDE))
+    return np.array(image)

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vg2gt.io.files import write_text
 from vg2gt.io.gaussian_arrays import to_arrays
@@ -95,7 +96,11 @@ def pack(gaussians: Gaussians) -> tuple[dict[str, float], bytes]:
 def _content(scene: ViewerScene, header: dict[str, float]) -> dict[str, Any]:
     """Returns the page's JSON content, without the packed Gaussians."""
     options = RenderOptions(mode="rasterized")
-    cameras = [{**camera.fields(), "picture": _jpeg(scene, index)} for index, camera in enumerate(scene.cameras)]
+    pictures = scene.pictures or [None] * len(scene.cameras)
+    cameras = [
+        {**camera.fields(), "picture": None if picture is None else _jpeg(picture)}
+        for camera, picture in zip(scene.cameras, pictures, strict=True)
+    ]
     behind = scene.gaussians.background
     return {
         "gaussians": header,
@@ -113,10 +118,7 @@ def _content(scene: ViewerScene, header: dict[str, float]) -> dict[str, Any]:
     }
 
 
-def _jpeg(scene: ViewerScene, index: int) -> str | None:
-    picture = scene.picture(index)
-    if picture is None:
-        return None
+def _jpeg(picture: NDArray[np.uint8]) -> str:
     return base64.b64encode(encode_image(picture, "JPEG", quality=JPEG_QUALITY)).decode()
 
 
