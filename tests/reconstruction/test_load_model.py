@@ -48,7 +48,8 @@ def test_what_is_unknown_is_named(overrides: list[str], said: str) -> None:
 def test_a_slim_checkpoint_is_the_same_model(run_folder: Path, tmp_path: Path) -> None:
     """Weights without the optimiser, with their configuration: no run folder is needed."""
     known = torch.load(run_folder / "checkpoints" / "step-7.ckpt", weights_only=True)
-    known["config"] = known["config"].replace("depth_noise:", "drift: 0.0\n  depth_noise:")  # as a former version wrote it
+    # as a former version wrote it
+    known["config"] = known["config"].replace("depth_noise:", "drift: 0.0\n  depth_noise:")
     assert "drift" in known["config"]
     torch.save(known, tmp_path / "whole.ckpt")
     slim = write_slim(tmp_path / "whole.ckpt", tmp_path / "weights.safetensors")
