@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from numba.core.dispatcher import Dispatcher
 
 from tests.commands import ROOT
 from vg2gt.kernels import compiled
@@ -106,6 +107,20 @@ def test_processes_that_compile_at_once_never_run_each_others_code(make) -> None
     assert repr((third(1), third(1.5))) == "(2, 2.5)"  # 2, not 2.0
 
 
+@pytest.mark.parametrize("ending", ["nbc", "nbi"])
+def test_a_damaged_file_is_compiled_again(ending: str, tmp_path: Path, make, caplog: pytest.LogCaptureFixture) -> None:
+    make()(1)
+    (file,) = (tmp_path / "cache").rglob(f"*.{ending}")
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    assert make()(1) == 2
+    assert "compiling it again" in caplog.text
+    caplog.clear()
+    last = make()
+    assert last(1) == 2
+    assert not last.stats.cache_misses
+    assert not caplog.records
+
+
 def test_kernels_take_what_they_need_from_their_own_room() -> None:
     """Else the hash would not know of it. Functions of ``numba.njit`` are inlined into kernels and not kept."""
     wrong, kernels = [], 0
@@ -132,3 +147,17 @@ def test_kernels_take_what_they_need_from_their_own_room() -> None:
                 wrong += [f"{path}: {m}" for m in modules if m.startswith("vg2gt.") and not m.startswith(own)]
     assert kernels >= 9
     assert not wrong
+
+
+def test_kernels_made_in_functions_are_found_again_by_other_processes() -> None:
+    """A kernel in a closure has another key in every process, which would compile it again and leave one more file."""
+    made = [
+        kernel
+        for path in sorted((*ROOT.glob("vg2gt/**/*.py"), *ROOT.glob("backends/**/*.py")))
+        if "import kernel" in path.read_text()
+        for kernel in vars(importlib.import_module(".".join(path.relative_to(ROOT).with_suffix("").parts))).values()
+        if isinstance(kernel, Dispatcher) and kernel.py_func.__closure__
+    ]
+    assert len(made) >= 6
+    for kernel in made:
+        assert all(isinstance(cell.cell_contents, bool) for cell in kernel.py_func.__closure__), kernel

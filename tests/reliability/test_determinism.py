@@ -22,10 +22,10 @@ def _settings() -> Iterator[None]:
     torch.set_num_threads(threads)
 
 
-def trained_weights(folder: Path, cache: Path, *overrides: str) -> Tensor:
-    torch.set_num_threads(1)
-    torch.rand(1)  # the state of the global generator before a run must not matter
-    options = [DROP, "trainer.deterministic=true", "trainer.max_steps=3", "data.train_scenes=4"]
+def trained_weights(folder: Path, cache: Path, *overrides: str, threads: int = 1, steps: int = 3) -> Tensor:
+    torch.set_num_threads(threads)
+    torch.rand(threads)  # the state of the global generator before a run must not matter
+    options = [DROP, "trainer.deterministic=true", f"trainer.max_steps={steps}", "data.train_scenes=4"]
     run = tiny_run(folder, cache, *options, *overrides)
     before = weights(run).clone()
     run.trainer.fit(run.module, datamodule=run.datamodule)
@@ -39,10 +39,20 @@ def first(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> Tensor:
     return trained_weights(tmp_path_factory.mktemp("first"), cache)
 
 
-@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize("workers", [0, 1, 2])
 def test_two_runs_are_bit_equal_with_any_number_of_workers(first, tmp_path, cache, workers):
     assert torch.equal(trained_weights(tmp_path, cache, f"data.workers={workers}"), first)
 
 
 def test_another_seed_gives_other_weights(first: Tensor, tmp_path: Path, cache: Path) -> None:
     assert not torch.equal(trained_weights(tmp_path, cache, "seed=1"), first)
+
+
+@pytest.mark.slow
+def test_thirty_steps_are_bit_equal(tmp_path: Path, cache: Path) -> None:
+    """With several scenes a step, held-out views, and frames read by workers."""
+    runs = [
+        trained_weights(tmp_path / str(workers), cache, "data.max_images=4", f"data.workers={workers}", steps=30)
+        for workers in (0, 0, 1, 2)
+    ]
+    assert all(torch.equal(run, runs[0]) for run in runs[1:])

@@ -23,6 +23,8 @@ from vg2gt.types import Batch
 
 OBJECTIVES = {
     "default": VG2GTLoss(),
+    "decoded normals, trusted alike": VG2GTLoss(gaussian=GaussianLoss(confidence_weighted=False)),
+    "rendered normals": VG2GTLoss(gaussian=GaussianLoss(normal_target="render")),
     "true normals": VG2GTLoss(gaussian=GaussianLoss(normal_target="gt")),
     "hinge on the error": VG2GTLoss(enhance=EnhancementLoss(margin=0.01, on="reg")),
     "hinge as printed": VG2GTLoss(enhance=EnhancementLoss(form="paper_literal")),
@@ -52,14 +54,32 @@ def scene_of(sample: Sample, index: int) -> Sample:
     return replace(sample, batch=sample.batch.single(index), prediction=replace(whole, **changes), **shown)
 
 
+def leaves(sample: Sample) -> tuple[Sample, list[Tensor]]:
+    """The same sample, and the tensors of the prediction to which gradients flow."""
+    geometry = sample.prediction.geometry
+    depth, conf = (t.clone().requires_grad_() for t in (geometry.depth, geometry.depth_conf))
+    render = {name: tensor.clone().requires_grad_() for name, tensor in vars(sample.rendered).items()}
+    return sample.with_depth(depth, conf).with_render(**render), [depth, conf, *render.values()]
+
+
+def value_and_gradients(loss: VG2GTLoss, sample: Sample) -> tuple[Tensor, dict[str, Tensor], list[Tensor]]:
+    sample, inputs = leaves(sample)
+    report = loss(*sample.inputs)
+    gradients = torch.autograd.grad(report.total, inputs, allow_unused=True, materialize_grads=True)
+    return report.total.detach(), report.terms, list(gradients)
+
+
 @pytest.mark.parametrize("name", OBJECTIVES)
 def test_the_loss_of_two_scenes_is_the_mean_of_theirs(name: str) -> None:
     loss, sample = OBJECTIVES[name], two_scenes()
-    both, first, second = (loss(*each.inputs) for each in (sample, scene_of(sample, 0), scene_of(sample, 1)))
-    torch.testing.assert_close(both.total, (first.total + second.total) / 2, rtol=1e-12, atol=0)
-    assert first.total != second.total
-    for term, value in both.terms.items():
-        torch.testing.assert_close(value, (first.terms[term] + second.terms[term]) / 2, rtol=1e-12, atol=1e-14)
+    total, terms, gradients = value_and_gradients(loss, sample)
+    alone = [value_and_gradients(loss, scene_of(sample, index)) for index in range(2)]
+    torch.testing.assert_close(total, (alone[0][0] + alone[1][0]) / 2, rtol=1e-12, atol=0)
+    assert alone[0][0] != alone[1][0]
+    for term, value in terms.items():
+        torch.testing.assert_close(value, (alone[0][1][term] + alone[1][1][term]) / 2, rtol=1e-12, atol=1e-14)
+    for together, first, second in zip(gradients, alone[0][2], alone[1][2], strict=True):
+        torch.testing.assert_close(together, torch.cat((first, second)) / 2, rtol=1e-9, atol=1e-14)
 
 
 def step(run: Run, batch: Batch) -> tuple[Tensor, Tensor]:
@@ -79,7 +99,7 @@ def test_the_step_of_two_scenes_is_the_mean_of_theirs(tmp_path: Path, cache: Pat
     run = tiny_run(tmp_path, cache, "data.max_images=4")
     batch = first_batches(run, 1)[0]
     generator, apart, deviations = torch.Generator().manual_seed(0), [], []
-    for _ in range(3):
+    for _ in range(5):
         with torch.no_grad():  # away from the zero convolutions
             for parameter in run.module.model.trained_parameters():
                 parameter += 0.02 * torch.randn(parameter.shape, generator=generator)
@@ -131,7 +151,7 @@ def results(two: tuple[Path, list[subprocess.CompletedProcess]], name: str) -> l
 
 
 def test_two_processes_train_like_one_with_twice_the_scenes(two, tmp_path: Path, cache: Path) -> None:
-    run = tiny_run(tmp_path, cache, *two_ranks.sgd_steps(scenes=2))
+    run = tiny_run(tmp_path, cache, *two_ranks.step_overrides(two_ranks.SGD, 4, scenes=2))
     before = two_ranks.weights(run)
     one = two_ranks.trained(run)
     assert (one["weights"] - before).abs().max() > 1e-3
@@ -199,3 +219,14 @@ def test_tasks_of_a_slurm_job_find_each_other(tmp_path: Path, cache: Path) -> No
         for task in tasks:
             task.kill()
     assert (tmp_path / "outputs" / "job" / "metrics.json").is_file()
+
+
+@pytest.mark.slow
+def test_forty_steps_on_two_processes(tmp_path: Path, cache: Path) -> None:
+    """The ranks stay equal to the bit."""
+    names = ("adamw_long", "muon_long")
+    ended = two_ranks.run_on_two_ranks(tmp_path, cache, *names, timeout=1500)
+    for name in names:
+        one, two = results((tmp_path, ended), name)
+        assert torch.equal(one["weights"], two["weights"])
+        assert one["losses"] == two["losses"]

@@ -1,5 +1,7 @@
 """Precision: bfloat16 networks agree with float32 ones, and geometry is never below float32."""
 
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -9,8 +11,15 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+import vg2gt.baselines.pixel_aligned
+import vg2gt.baselines.pixels
+import vg2gt.losses.objective
+import vg2gt.method.additions.surface_evidence
 import vg2gt.method.coarse
 import vg2gt.method.fine
+import vg2gt.rendering.renderer
+import vg2gt.rendering.scenes
+import vg2gt.training.module
 from tests.reliability.steps import first_batches, fit, tiny_run
 from tests.training_helpers import full_model
 from vg2gt.evaluation.in_training import evaluate_scene
@@ -18,7 +27,7 @@ from vg2gt.losses.gaussian import GaussianLoss
 from vg2gt.losses.geometry import GeometryLoss
 from vg2gt.model import SceneScale
 from vg2gt.rendering import Renderer
-from vg2gt.types import Voxels, _map_value
+from vg2gt.types import Voxels
 
 STEPS = 6
 LOSS_TOLERANCE = 5e-3  # of the largest loss, in every step
@@ -66,21 +75,20 @@ class BothPrecisions(lightning.Callback):
         return float(loss.detach()), torch.cat([gradient.flatten().double() for gradient in gradients])
 
 
-@pytest.mark.parametrize("overrides", [PLAIN, ()], ids=["plain", "surfels"])
-def test_bfloat16_networks_agree_with_float32(overrides: tuple[str, ...], tmp_path: Path, cache: Path) -> None:
+def check_agreement(overrides: tuple[str, ...], steps: int, folder: Path, cache: Path) -> None:
     """Every step agrees at equal weights, and training in bfloat16 arrives where training in float32 does."""
-    exact, mixed = (tiny_run(tmp_path, cache, f"trainer.precision={p}", *overrides) for p in ("32-true", "bf16-mixed"))
+    exact, mixed = (tiny_run(folder, cache, f"trainer.precision={p}", *overrides) for p in ("32-true", "bf16-mixed"))
     noted = BothPrecisions()
     exact.trainer.callbacks.append(noted)  # pyright: ignore[reportAttributeAccessIssue]
     for run in (exact, mixed):
-        fit(run, first_batches(run, STEPS)).assert_sound()
+        fit(run, first_batches(run, steps)).assert_sound()
     # Terms of both signs: a loss may be next to nothing, its rounding is not.
     size = max(abs(one) for one, _ in noted.losses)
     surfels = getattr(getattr(exact.module.model, "gaussians", None), "start", "plain") == "surfel"
     for one, other in noted.losses:
         assert other == pytest.approx(one, abs=size * (SURFEL_LOSS_TOLERANCE if surfels else LOSS_TOLERANCE))
         assert other != one  # autocast was on
-    assert len(noted.cosines) == STEPS
+    assert len(noted.cosines) == steps
     worst, second = sorted(noted.cosines)[:2]
     assert worst > (SURFEL_WORST if surfels else COSINE)
     assert second > (SURFEL_COSINE if surfels else COSINE)
@@ -94,35 +102,114 @@ def test_bfloat16_networks_agree_with_float32(overrides: tuple[str, ...], tmp_pa
         assert scores[1][name] == pytest.approx(scores[0][name], abs=tolerance), name
 
 
-WATCHED = [(called, "__call__") for called in (Renderer, SceneScale, GeometryLoss, GaussianLoss)]
-WATCHED += [(module, "point_cells") for module in (vg2gt.method.coarse, vg2gt.method.fine)]
+@pytest.mark.parametrize("overrides", [PLAIN, ()], ids=["plain", "surfels"])
+def test_bfloat16_networks_agree_with_float32(overrides: tuple[str, ...], tmp_path: Path, cache: Path) -> None:
+    check_agreement(overrides, STEPS, tmp_path, cache)
 
 
-@pytest.mark.parametrize("backend", ["oracle", "da3_tiny"])
-def test_geometry_is_never_below_float32(backend, tmp_path, cache, monkeypatch):
-    """What goes into the functions of geometry and comes out of them, while networks are in bfloat16."""
-    run = tiny_run(tmp_path, cache, "trainer.precision=bf16-mixed", f"backend={backend}")
-    seen: dict[str, set[torch.dtype]] = {}
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ("data.image_size=[112,224]", "data.max_views=4", "data.min_views=4", "data.max_images=4"),
+        ("backend=da3_tiny",),
+        ("backend=vggt_tiny",),
+        ("ablation=wo_coarse",),
+        ("model=pixel_aligned",),
+        ("model=voxel_merged",),
+        ("model.gaussians.sh_degree=2",),
+    ],
+    ids=" ".join,
+)
+def test_bfloat16_networks_agree_for_longer_and_in_every_model(overrides, tmp_path, cache):
+    check_agreement(overrides, 40, tmp_path, cache)
 
-    def watch(owner: Any, name: str) -> None:
-        label, original = f"{owner.__name__}.{name}", getattr(owner, name)
+
+def dtypes(value: Any, skip: tuple[str, ...] = ()) -> Iterator[tuple[str, torch.dtype]]:
+    """Names and dtypes of all floating-point tensors in records, tuples and mappings."""
+    if isinstance(value, Tensor):
+        if value.is_floating_point():
+            yield "", value.dtype
+    elif is_dataclass(value) and not isinstance(value, type):
+        for field in fields(value):
+            if field.name not in skip:
+                yield from ((f".{field.name}{n}", d) for n, d in dtypes(getattr(value, field.name), skip))
+    elif isinstance(value, (tuple, list, dict)):
+        for key, item in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from ((f"[{key}]{n}", d) for n, d in dtypes(item, skip))
+
+
+# what networks may say in bfloat16: it becomes geometry in float32
+NETWORKS = ("patch", "camera", "features")
+
+
+def places(owner: Any, names: str) -> list[tuple[Any, str]]:
+    return [(owner, name) for name in names.split()]
+
+
+VOXELS = "unproject scene_voxel_size point_cells pool_mean pool_min"
+PLACES = [
+    *places(vg2gt.method.coarse, f"{VOXELS} interpolation_weights"),
+    (vg2gt.method.additions.surface_evidence, "normals_from_depth"),
+    *places(vg2gt.method.fine, VOXELS),
+    (vg2gt.training.module, "training_cameras"),
+    (vg2gt.rendering.scenes, "_scene_views"),
+    *((called, "__call__") for called in (Renderer, SceneScale, GeometryLoss, GaussianLoss)),
+    (vg2gt.losses.objective.VG2GTLoss, "forward"),
+    *places(vg2gt.losses.objective, "normalize_truth camera_errors"),
+]
+BASELINE_PLACES = [
+    (vg2gt.baselines.pixels, "ray_directions"),
+    *places(vg2gt.baselines.pixel_aligned, "point_cells pool_mean"),
+    (Renderer, "__call__"),
+]
+
+
+class Probe:
+    """Notes the dtypes that go into functions and come out of them."""
+
+    def __init__(self) -> None:
+        self.seen: set[str] = set()
+        self.low: set[str] = set()
+
+    def watch(self, owner: Any, name: str, patch: pytest.MonkeyPatch) -> None:
+        label, original = f"{getattr(owner, '__name__', owner)}.{name}", getattr(owner, name)
 
         def probed(*args: Any, **kwargs: Any) -> Any:
             result = original(*args, **kwargs)
-            _map_value((args, kwargs, result), lambda tensor: seen.setdefault(label, set()).add(tensor.dtype))
+            self.note(label, {"in": args, "in_named": kwargs, "out": result})
             return result
 
-        monkeypatch.setattr(owner, name, probed)
+        patch.setattr(owner, name, probed)
 
-    for place in WATCHED:
-        watch(*place)
+    def note(self, label: str, values: Any) -> None:
+        self.seen.add(label)
+        for name, dtype in dtypes(values, NETWORKS):
+            if torch.finfo(dtype).bits < 32:
+                self.low.add(f"{label}{name} is {dtype}")
+
+
+@pytest.mark.parametrize(
+    ("overrides", "watched"),
+    [((), PLACES), (("backend=da3_tiny",), PLACES), (("model=voxel_merged",), BASELINE_PLACES)],
+    ids=["full", "da3_tiny", "voxel_merged"],
+)
+def test_geometry_is_never_below_float32(overrides, watched, tmp_path, cache, monkeypatch):
+    run = tiny_run(tmp_path, cache, "trainer.precision=bf16-mixed", *overrides)
+    probe = Probe()
+    for owner, name in (*watched, *places(run.module.model.backend, "decode encode")):
+        probe.watch(owner, name, monkeypatch)
     networks: set[torch.dtype] = set()
-    head = run.module.model.get_submodule("fine.dense_head")
-    head.register_forward_hook(lambda module, args, out: networks.add(out.dtype))
+    for name, module in run.module.model.named_modules():
+        if name in ("", "fine", "gaussians", "coarse"):
+            module.register_forward_hook(lambda module, args, out, name=name: probe.note(f"model.{name}", (args, out)))
+        if name.endswith("dense_head"):
+            module.register_forward_hook(lambda module, args, out: networks.add(out.dtype))
     (batch,) = first_batches(run, 1)
     fit(run, [batch, batch]).assert_sound()
-    assert len(seen) == len(WATCHED)
-    assert not [label for label, dtypes in seen.items() if dtypes & {torch.bfloat16, torch.float16}]
+    expected = {f"{getattr(owner, '__name__', owner)}.{name}" for owner, name in watched}
+    assert expected <= probe.seen
+    assert not probe.low
     assert networks == {torch.bfloat16}  # autocast was on, where it may be
     assert {parameter.dtype for parameter in run.module.parameters()} == {torch.float32}
 

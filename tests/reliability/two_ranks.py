@@ -23,6 +23,7 @@ from vg2gt.training.loop import Run, evaluate
 
 RANKS = ["trainer=ddp", "trainer.accelerator=cpu"]
 SGD = ["optimizer=adamw", "optimizer._target_=torch.optim.SGD", "~optimizer.betas", "optimizer.lr=0.05"]
+ADAMW = ["optimizer=adamw"]
 BLIND = ["no depth", "one pixel with depth", "held-out view looks away"]
 EMPTY = [*BLIND, "black images", "one view", "10 km, depth alone"]
 
@@ -53,9 +54,13 @@ def weights(run: Run) -> Tensor:
     return torch.cat([parameter.detach().flatten() for parameter in run.module.model.trained_parameters()])
 
 
-def sgd_steps(scenes: int) -> list[str]:
-    """A run of four steps of ``scenes`` scenes a device."""
-    return [*SGD, "trainer.max_steps=4", f"data.max_images={2 * scenes}", "data.train_scenes=6"]
+def step_overrides(optimizer: Sequence[str], steps: int, scenes: int) -> list[str]:
+    """A run of ``scenes`` scenes a step and device."""
+    return [*optimizer, f"trainer.max_steps={steps}", f"data.max_images={2 * scenes}", "data.train_scenes=6"]
+
+
+def equal_steps(folder: Path, cache: Path, optimizer: Sequence[str], steps: int) -> dict[str, Any]:
+    return trained(tiny_run(folder, cache, *RANKS, *step_overrides(optimizer, steps, scenes=1)))
 
 
 def empty_rank(folder: Path, cache: Path) -> dict[str, Any]:
@@ -117,7 +122,9 @@ def broken_loader(folder: Path, cache: Path) -> dict[str, Any]:
 
 
 SCENARIOS: dict[str, Callable[[Path, Path], dict[str, Any]]] = {
-    "sgd": lambda folder, cache: trained(tiny_run(folder, cache, *RANKS, *sgd_steps(scenes=1))),
+    "sgd": lambda folder, cache: equal_steps(folder, cache, SGD, 4),
+    "adamw_long": lambda folder, cache: equal_steps(folder, cache, ADAMW, 40),
+    "muon_long": lambda folder, cache: equal_steps(folder, cache, (), 40),
     "empty_rank": empty_rank,
     "faulty_rank": faulty_rank,
     "three_scenes": lambda folder, cache: three_scenes(folder, cache, *RANKS),
