@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -24,8 +24,8 @@ def read_cameras(path: str | Path) -> list[NamedCamera]:
     """Reads cameras from a file of any of these kinds; lens distortion is ignored.
 
     Args:
-        path: a ``cameras.json`` of ours or of 3D Gaussian Splatting, a ``transforms.json``, or the folder of a COLMAP
-            model or of a scene with one in ``sparse/0`` or ``sparse``.
+        path: a ``cameras.json``, a ``transforms.json``, or the folder of a COLMAP model or of a scene with one in
+            ``sparse/0`` or ``sparse``.
 
     Raises:
         FileNotFoundError: if the file does not exist.
@@ -38,11 +38,7 @@ def read_cameras(path: str | Path) -> list[NamedCamera]:
     if not path.is_file():
         raise FileNotFoundError(f"no cameras at {path}")
     content = load_json(path)
-    if isinstance(content, dict) and "frames" in content:
-        return _of_transforms(path)
-    if isinstance(content, list) and content and isinstance(content[0], dict) and "img_name" in content[0]:
-        return [_of_3dgs(f"{path}: [{index}]", entry) for index, entry in enumerate(content)]
-    return read_cameras_json(path)
+    return _of_transforms(path) if isinstance(content, dict) and "frames" in content else read_cameras_json(path)
 
 
 def _of_colmap(folder: Path) -> list[NamedCamera]:
@@ -69,21 +65,6 @@ def _of_transforms(path: Path) -> list[NamedCamera]:
     return cameras
 
 
-def _of_3dgs(place: str, entry: Any) -> NamedCamera:
-    """Converts an entry of 3DGS's ``cameras.json``, which has no principal point: the image centre is used."""
-    try:
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = entry["rotation"], entry["position"]  # camera to world
-        width, height = int(entry["width"]), int(entry["height"])
-        fx, fy, name = float(entry["fx"]), float(entry["fy"]), str(entry["img_name"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise FormatError(f"{place}: not a camera of 3D Gaussian Splatting ({error!r})") from error
-    if not (np.isfinite(pose).all() and min(width, height) > 0 and min(fx, fy) > 0):
-        raise FormatError(f"{place}: values that are not finite, or no positive size and focal length")
-    matrix = np.array([[fx, 0, (width - 1) / 2], [0, fy, (height - 1) / 2], [0, 0, 1]])
-    return NamedCamera(name, width, height, matrix, invert_pose(pose))
-
-
 def interpolate(cameras: Sequence[NamedCamera], between: int) -> list[NamedCamera]:
     """Returns a smooth path through given cameras: splines of position and rotation, linear intrinsics.
 
@@ -102,25 +83,20 @@ def interpolate(cameras: Sequence[NamedCamera], between: int) -> list[NamedCamer
     sizes = {(camera.width, camera.height) for camera in cameras}
     if len(sizes) > 1:
         raise ValueError(f"cameras of one image size are needed, these have {sorted(sizes)}; choose some of one size")
-    times = np.arange(len(cameras), dtype=np.float64)
+    times = np.arange(len(cameras))
     poses = np.stack([invert_pose(camera.world_to_camera) for camera in cameras])
     positions = CubicSpline(times, poses[:, :3, 3], bc_type="natural")
     rotations = RotationSpline(times, Rotation.from_matrix(poses[:, :3, :3]))
-    intrinsics = np.stack([camera.intrinsics for camera in cameras])
-    path = []
-    for number in range((len(cameras) - 1) * (between + 1) + 1):
-        left, step = divmod(number, between + 1)
-        if step == 0:  # exactly the given camera, free of spline rounding
-            path.append(cameras[left])
-            continue
-        time = left + step / (between + 1)
-        pose = np.eye(4)
-        pose[:3, :3] = rotations(time).as_matrix()
-        pose[:3, 3] = positions(time)
-        share = time - left
-        k = (1 - share) * intrinsics[left] + share * intrinsics[left + 1]
-        name = f"{view_stem(cameras[left].name)}-{step:03d}"
-        path.append(NamedCamera(name, cameras[0].width, cameras[0].height, k, invert_pose(pose)))
+    path = [cameras[0]]
+    for left, (one, other) in enumerate(itertools.pairwise(cameras)):
+        for step in range(1, between + 1):
+            share = step / (between + 1)
+            pose = np.eye(4)
+            pose[:3, :3], pose[:3, 3] = rotations(left + share).as_matrix(), positions(left + share)
+            intrinsics = (1 - share) * one.intrinsics + share * other.intrinsics
+            name = f"{view_stem(one.name)}-{step:03d}"
+            path.append(NamedCamera(name, one.width, one.height, intrinsics, invert_pose(pose)))
+        path.append(other)  # exactly, free of spline rounding
     return path
 
 

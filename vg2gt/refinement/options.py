@@ -10,7 +10,7 @@ from torch import Tensor
 from vg2gt.geometry.normals import normals_from_depth
 from vg2gt.geometry.spherical_harmonics import MAX_DEGREE
 from vg2gt.losses.gaussian import normal_error, structure_loss, weighted_mean
-from vg2gt.types import Cameras, Gaussians, Render, TensorRecord
+from vg2gt.types import Cameras, Render, TensorRecord
 
 RENDERINGS = 12  # of each view, if neither steps nor seconds are set
 MIN_ALPHA = 0.5
@@ -39,7 +39,7 @@ class Observations(TensorRecord):
 
 @dataclass(frozen=True)
 class RefineLoss:
-    """Loss of rendered views and of the Gaussians themselves.
+    """Loss of rendered views and of the opacities of Gaussians.
 
     Colour alone roughens surfaces: Gaussians in front of and behind a surface explain a pixel as well. The geometry
     terms hold Gaussians at the decoded depth, weighted by its confidence, and orient them along the surface that they
@@ -52,7 +52,6 @@ class RefineLoss:
         normal_render: weight of ``1 - cos`` between rendered normals and the normals of the rendered depth.
         normal_decoded: weight of ``1 - cos`` between rendered normals and the normals of the decoded depth.
         opacity: weight of the mean opacity, which makes Gaussians that no image needs transparent.
-        scale: weight of the mean growth of each Gaussian's largest side, relative to its initial length.
 
     Raises:
         ValueError: if a weight is negative.
@@ -64,7 +63,6 @@ class RefineLoss:
     normal_render: float = 0.1
     normal_decoded: float = 0.1
     opacity: float = 0.0
-    scale: float = 0.0
 
     def __post_init__(self) -> None:
         _not_negative(self, "loss")
@@ -101,15 +99,6 @@ class RefineLoss:
         if self.normal_decoded:
             expected, valid = normals_from_depth(seen.depth, cameras.intrinsics[0])
             terms["normal_decoded"] = normal_error(normal, expected, seen.depth_conf, hits & valid)
-        return terms
-
-    def of_gaussians(self, gaussians: Gaussians, size: Tensor) -> dict[str, Tensor]:
-        """Returns the unweighted terms of the Gaussians whose weight is not 0; ``size [G]``: initial largest sides."""
-        terms: dict[str, Tensor] = {}
-        if self.opacity:
-            terms["opacity"] = gaussians.opacities.mean()
-        if self.scale:
-            terms["scale"] = (gaussians.scales.max(-1).values / size - 1).clamp(min=0).mean()
         return terms
 
     def total(self, terms: dict[str, Tensor]) -> Tensor:
@@ -161,8 +150,6 @@ class RefineOptions:
         steps: maximum number of steps; None: end by ``seconds`` or, if that is None too, after 12 renderings of each
             view.
         seconds: maximum time; None: end by ``steps``. On a CPU, a number of steps is reproducible, a time is not.
-        views_per_step: number of views rendered per step.
-        final_rate: factor to which rates decay exponentially.
         check_every: number of steps between checks. In between, some views are left out, in rotation. A check scores
             them and prunes transparent Gaussians.
         holdout: never train on every N-th view, but score it before and after; None: train on all.
@@ -172,8 +159,6 @@ class RefineOptions:
             than agree: Gaussians that a single view supports overfit it. 0: keep all.
         merge_cells: merge Gaussians at the start if at least two, but fewer than ``min_views``, views agree with them,
             in cells this many times as wide as what the median Gaussian covers. 0: remove them.
-        prune_opacity: opacity below which Gaussians are removed.
-        max_growth: maximum number of Gaussians after filling holes, as a multiple of the initial number.
         seed: random seed of the view order.
         rates: learning rates.
         loss: loss to minimise.
@@ -184,16 +169,12 @@ class RefineOptions:
 
     steps: int | None = None
     seconds: float | None = None
-    views_per_step: int = 1
-    final_rate: float = 0.1
     check_every: int = 20
     holdout: int | None = None
     sh_degree: int | None = None
     fill: int = 4
     min_views: int = 0
     merge_cells: float = 0.0
-    prune_opacity: float = 0.02
-    max_growth: float = 1.5
     seed: int = 0
     rates: RefineRates = field(default_factory=RefineRates)
     loss: RefineLoss = field(default_factory=RefineLoss)
@@ -202,31 +183,22 @@ class RefineOptions:
         for name, good, expected in (
             ("steps", self.steps is None or self.steps >= 1, "at least 1, or null"),
             ("seconds", self.seconds is None or self.seconds > 0, "positive, or null"),
-            ("views_per_step", self.views_per_step >= 1, "at least 1"),
-            ("final_rate", 0 < self.final_rate <= 1, "above 0 and at most 1"),
             ("check_every", self.check_every >= 1, "at least 1"),
             ("holdout", self.holdout is None or self.holdout >= 2, "at least 2, or null"),
             ("sh_degree", self.sh_degree is None or 0 <= self.sh_degree <= MAX_DEGREE, f"0 to {MAX_DEGREE}, or null"),
             ("fill", self.fill >= 0, "at least 0"),
             ("min_views", self.min_views >= 0, "at least 0"),
             ("merge_cells", self.merge_cells >= 0, "at least 0"),
-            ("prune_opacity", 0 <= self.prune_opacity < 1, "at least 0 and below 1"),
-            ("max_growth", self.max_growth >= 1, "at least 1"),
         ):
             if not good:
                 raise ValueError(f"refine.{name} must be {expected}, got {getattr(self, name)}")
 
     def of(self, views: int) -> RefineOptions:
         """Returns the options for this number of trained views, with ``steps`` set if they have no end."""
-        if self.steps is not None or self.seconds is not None:
-            return self
-        return replace(self, steps=-(-RENDERINGS * views // self.views_per_step))
+        endless = self.steps is None and self.seconds is None
+        return replace(self, steps=RENDERINGS * views) if endless else self
 
     def done(self, step: int, seconds: float) -> float:
         """Returns the share of the refinement that is done after ``step`` steps and ``seconds``, at most 1."""
-        shares = [0.0]
-        if self.steps is not None:
-            shares.append(step / self.steps)
-        if self.seconds is not None:
-            shares.append(seconds / self.seconds)
-        return min(1.0, max(shares))
+        limits = ((step, self.steps), (seconds, self.seconds))
+        return min(1.0, max(passed / limit for passed, limit in limits if limit is not None))
