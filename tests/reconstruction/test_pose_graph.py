@@ -145,6 +145,5 @@ def test_the_simulated_backbone_with_drift_closes_a_loop_of_200_frames(tmp_path)
         centers, there = camera_centers(placed).float(), camera_centers(true)
         apart = (align_points(centers, there).apply(centers) - there).norm(dim=-1)
         errors.append(float(apart.square().mean().sqrt()) / length)
-    print(f"error over length: open {errors[0]:.4f}, closed {errors[1]:.4f}")
     assert errors[0] > 0.01
     assert errors[1] < 0.01

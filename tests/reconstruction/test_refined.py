@@ -8,12 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from vg2gt.cli import main
 from vg2gt.cli.reconstruct import _refinement
 from vg2gt.io import read_cameras_json, read_gaussian_ply, write_cameras_json
-from vg2gt.reconstruction.saved import read_scene
 from vg2gt.reconstruction.scene import Scene
 from vg2gt.refinement import RefineOptions, RefineRates
 
@@ -30,17 +28,6 @@ def saved(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("saved") / "room"
     scene.save(folder, ["scene.ply", "cameras.json", "views.npz"])
     return folder
-
-
-def test_a_saved_scene_comes_back(saved: Path, scene: Scene) -> None:
-    back = read_scene(saved, scene.renderer)
-    assert back.names == scene.names
-    assert torch.equal(back.depth, scene.depth)
-    assert torch.equal(back.depth_conf, scene.depth_conf)
-    assert (back.images - scene.images).abs().max() <= 0.5 / 255 + 1e-6
-    torch.testing.assert_close(back.cameras.world_to_camera, scene.cameras.world_to_camera)
-    torch.testing.assert_close(back.gaussians.means, scene.gaussians.means)
-    assert back.mask is None
 
 
 def test_the_command(saved: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:

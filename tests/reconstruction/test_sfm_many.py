@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from vg2gt.geometry.alignment import align_points
 from vg2gt.geometry.cameras import camera_centers
@@ -65,20 +64,6 @@ def test_many_photographs_are_matched_in_likely_pairs(shared: Path, tmp_path: Pa
     pictures = sfm.find_cameras(find_pictures(office_photos(shared, 8)), tmp_path / "sfm", Monitor())
     assert (len(pictures), len(pairs)) == (8, 7 + 6 + 4)
     assert center_errors(pictures, shared, list(range(8))).median() < 0.03
-
-
-def test_a_camera_that_only_turns_is_refused_and_nothing_is_kept(shared: Path, tmp_path: Path) -> None:
-    pytest.importorskip("pycolmap")
-    wide = np.array(Image.open(office_photos(shared, 9)[8]).resize((1080, 720)))
-    row, column = np.mgrid[:300, :400]
-    views = []
-    for turn in np.linspace(-0.35, 0.35, 8):
-        x, z = (column - 200) * np.cos(turn) + 400 * np.sin(turn), 400 * np.cos(turn) - (column - 200) * np.sin(turn)
-        places = np.round((row - 150) / z * 400 + 360), np.round(x / z * 400 + 540)
-        views.append(wide[places[0].clip(0, 719).astype(int), places[1].clip(0, 1079).astype(int)])
-    with pytest.raises(ValueError, match=r"cannot find the cameras of these 8 images.*rather than turning on the spot"):
-        sfm.find_cameras(find_pictures(views), tmp_path / "sfm", Monitor())
-    assert not (tmp_path / "sfm").exists()
 
 
 def test_parts_are_named(photos: Path, tmp_path: Path, monkeypatch, caplog) -> None:

@@ -76,8 +76,10 @@ def test_files_carry_it_and_scenes_of_before_are_read(written: Path, stated: Sce
     np.testing.assert_array_equal(found["support"], status.numpy())
     assert (status == Status.AGREED).float().mean() > 0.3
     back = read_scene(written, Renderer())
-    assert torch.equal(back.error, stated.error)
-    assert torch.equal(back.support, stated.support)
+    for name in ("error", "support", "depth", "depth_conf"):
+        assert torch.equal(getattr(back, name), getattr(stated, name))
+    assert (back.images - stated.images).abs().max() <= 0.5 / 255 + 1e-6
+    torch.testing.assert_close(back.cameras.world_to_camera, stated.cameras.world_to_camera)
     write_outputs(replace(stated, support=None, error=None), tmp_path, ["scene.ply", "cameras.json", "views.npz"])
     assert read_properties(tmp_path / "scene.ply", "error") == {}
     assert read_scene(tmp_path, Renderer()).support is None

@@ -257,7 +257,7 @@ def _views(scene: Scene, path: Path) -> None:
     maps = {name: getattr(scene, name) for name in ("depth", "depth_conf", "mask", "error", "support")}
     arrays = {name: values.numpy() for name, values in maps.items() if values is not None}
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, names=np.array(scene.names), images=images, **arrays)
+    np.savez_compressed(buffer, names=np.array(scene.names), images=images, **arrays)  # pyright: ignore[reportArgumentType]
     write_bytes(path, buffer.getvalue())
 
 
