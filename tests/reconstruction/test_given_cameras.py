@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
-from tests.data.sources.layout_phone import write_polycam, write_r3d
+from tests.data.sources.layout_phone import write_polycam
 from tests.data.sources.layouts import room
 from tests.reconstruction.conftest import SIZE
 from vg2gt import io
@@ -88,13 +88,11 @@ def test_depth_is_read_where_a_recording_has_it(recording: Path, tmp_path: Path,
     check_cameras(given_pictures(tmp_path / "room"), frames, "cameras.json")
 
 
-def test_some_of_the_images(folder: Path, recording: Path, tmp_path: Path) -> None:
+def test_some_of_the_images(folder: Path, recording: Path) -> None:
     put_poses(folder, recording)
     assert [p.name for p in given_pictures(folder, max_images=2) or []] == ["008", "011"]
     both = given_pictures([folder / "images" / "010.png", folder / "images" / "008.png"])
     assert [p.name for p in both or []] == ["010", "008"]
-    write_r3d(tmp_path, room(2))
-    assert [p.path for p in given_pictures(tmp_path / "sofa.r3d") or []] == [None, None]  # no files of their own
 
 
 def test_cameras_json_of_larger_images_and_without_some(folder: Path, frames, caplog) -> None:

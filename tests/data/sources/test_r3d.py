@@ -54,6 +54,7 @@ def test_without_lzfse_colour_and_cameras_are_read_and_the_remedy_is_named(tmp_p
         RGBDFolder(str(tmp_path), holdout=None).load("sofa.r3d", [0])
     for way in (tmp_path / "sofa.r3d", tmp_path):
         given = given_pictures(way)
+        assert all(picture.path is None for picture in given)  # they have no files of their own to copy
         assert [(picture.name, picture.size, picture.has_depth) for picture in given] == [
             ("0", SIZE, False),
             ("1", SIZE, False),
