@@ -95,7 +95,10 @@ def find_pictures(images: ImagesLike, max_images: int | None = None) -> list[Pic
     if not chosen:
         raise ValueError("there are no images to reconstruct; give image files, a folder of them, or a video")
     taken = evenly(chosen, max_images)
-    _check_masks([picture.path for picture in taken if picture.path is not None])
+    photos = [picture.path for picture in taken if picture.path is not None]
+    masks = {place / MASKS for photo in photos for place in (photo.parent, photo.parent.parent)}
+    if known := sorted(folder for folder in masks if folder.is_dir()):
+        warn_without_mask([photo.name for photo in photos if mask_file(photo) is None], len(photos), known[0], "masks")
     return with_unique_names(taken)
 
 
@@ -165,15 +168,6 @@ def mask_file(path: Path) -> Path | None:
     return next((file for file in files if file is not None), None)
 
 
-def _check_masks(photos: Sequence[Path]) -> None:
-    """Warns about photographs without a mask next to a folder of masks."""
-    folders = {place / MASKS for photo in photos for place in (photo.parent, photo.parent.parent)}
-    known = sorted(folder for folder in folders if folder.is_dir())
-    if known:
-        lacking = [photo.name for photo in photos if mask_file(photo) is None]
-        warn_without_mask(lacking, len(photos), known[0], "masks")
-
-
 def mask_for(path: Path, upright: bool = True, content: bytes | None = None) -> NDArray[np.float32] | None:
     """Returns the pixel weights of a photograph: the product of its alpha and its mask file (:func:`mask_file`)."""
     parts = [read_mask(path, "", content=content, upright=upright)]
@@ -229,7 +223,11 @@ def _is_image(path: Path) -> bool:
 def _photo(path: Path, content_of: Callable[[Path], bytes | None] = lambda _: None) -> Picture:
     """Returns a photograph; ``content_of`` reads files inside an archive."""
     if path.suffix.lower() in HEIC_SUFFIXES:
-        _open_heic(path)
+        if importlib.util.find_spec("pillow_heif") is None:
+            raise ValueError(f"{path} is HEIC and requires pillow-heif: pip install pillow-heif, or save it as JPEG")
+        from pillow_heif import register_heif_opener  # pyright: ignore[reportMissingImports]
+
+        register_heif_opener()
 
     def read(size: tuple[int, int]) -> Frames:
         content = content_of(path)
@@ -245,15 +243,6 @@ def _photo(path: Path, content_of: Callable[[Path], bytes | None] = lambda _: No
             f"{path} is a 360 degree panorama, which no pinhole camera represents: convert it to cube faces"
         )
     return Picture(path.stem, size, read, focal=focal_length(path, size), path=path)
-
-
-def _open_heic(path: Path) -> None:
-    """Registers pillow-heif, with which Pillow reads HEIC files."""
-    if importlib.util.find_spec("pillow_heif") is None:
-        raise ValueError(f"{path} is HEIC and requires pillow-heif: pip install pillow-heif, or save photos as JPEG")
-    from pillow_heif import register_heif_opener  # pyright: ignore[reportMissingImports]
-
-    register_heif_opener()
 
 
 def _video(path: Path, limit: int) -> list[Picture]:

@@ -35,6 +35,7 @@ from vg2gt.reconstruction.windows.placement import (
 )
 from vg2gt.reconstruction.windows.store import (
     ANCHOR,
+    SET,
     Anchor,
     Capture,
     Window,
@@ -132,7 +133,7 @@ class WindowRun:
             write_json(self.folder / ANCHOR, anchor.plain())
         self.anchor = anchor
         self._pool(geometry, torch.tensor([anchor.voxel_size]))
-        self.store.finish()
+        write_json(self.store.folder / SET, {"finished": True})
         geometry = replace(geometry, cameras=geometry.cameras.to(self.device))
         return geometry, gaussians_of(self.model, self.folder, anchor, self.monitor), unit
 

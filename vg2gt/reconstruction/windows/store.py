@@ -58,10 +58,6 @@ class WindowStore:
         if not (self.folder / SET).is_file():
             write_json(self.folder / SET, {"finished": False})
 
-    def finish(self) -> None:
-        """Marks the set as finished."""
-        write_json(self.folder / SET, {"finished": True})
-
     def array(self, name: str, shape: Sequence[int] | None = None, fill: float = 0) -> Tensor:
         """Returns a memory-mapped float32 array of the folder; writing to the tensor writes to the file.
 
