@@ -1,4 +1,4 @@
-"""A backend whose answer for a view does not depend on the others, so that windows can be compared with all at once."""
+"""Backends that stand in for others: their answer for a view does not depend on the other views."""
 
 from typing import ClassVar
 
@@ -64,3 +64,26 @@ class ByHeart(ByItself):
         poses[:, :3, 3] *= unit
         cameras = Cameras(poses[None], known.intrinsics[ids][None], (images.shape[-2], images.shape[-1]))
         return super().encode(images, Hints(known.depth[ids][None] * unit, cameras, ("heart",), ids[None]))
+
+
+class PlaneAhead(Backend):
+    """Depth is the middle of the range that it is told, else 1."""
+
+    def __init__(self) -> None:
+        super().__init__("plane_ahead", 14, (16,), licence="none", needs_hints=True)
+        self.freeze()
+
+    def encode(self, images: Tensor, hints: Hints | None = None) -> Tokens:
+        self.check_images(images)
+        hints = self.require_hints(images, hints, "cameras")
+        batch, views, _, height, width = images.shape
+        patches = (height // 14) * (width // 14)
+        tokens = self.as_tokens(images, [torch.zeros(batch, views, patches, 16)], torch.zeros(batch, views, 8))
+        near_far = torch.ones(batch, 2) if hints.depth_range is None else hints.depth_range
+        depth = near_far.mean(-1)[:, None, None, None].expand(batch, views, height, width)
+        state = {"cameras": hints.cameras, "depth": depth}
+        return Tokens(tokens.patch, tokens.camera, tokens.grid, tokens.size, state)
+
+    def decode(self, tokens: Tokens) -> Geometry:
+        depth = tokens.state["depth"] + 0 * tokens.patch[0].mean()
+        return Geometry(depth, torch.ones_like(depth), tokens.state["cameras"], torch.ones(len(depth)))

@@ -8,7 +8,7 @@ from PIL import Image
 
 from tests.data.sources.layout_rgbd import write_recording
 from tests.data.sources.layouts import pixels
-from tests.reconstruction.stand_in import PlaneAhead
+from tests.reconstruction.by_itself import PlaneAhead
 from tests.training_helpers import write_run
 from vg2gt.cli import reconstruct as reconstruct_command
 from vg2gt.data import SyntheticScenes

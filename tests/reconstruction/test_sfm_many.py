@@ -1,7 +1,6 @@
 """Structure from motion of many photographs, of parts, of copies, and of what cannot be solved."""
 
 import json
-import shutil
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -9,11 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from vg2gt.geometry.alignment import align_points
 from vg2gt.geometry.cameras import camera_centers
-from vg2gt.reconstruction import sfm, sfm_pairs
+from vg2gt.reconstruction import sfm
 from vg2gt.reconstruction.inputs import load_views
 from vg2gt.reconstruction.monitor import Monitor
 from vg2gt.reconstruction.pictures import Picture, find_pictures
@@ -42,12 +40,12 @@ def test_pairs_of_many_are_neighbours_and_those_that_look_alike() -> None:
     places = rng.integers(0, 100, (PLACES + 1, 30, 128))
     shown = [np.concatenate((places[i % PLACES], places[i % PLACES + 1])) for i in range(2 * PLACES)]
     descriptors = [(rows + rng.integers(0, 20, rows.shape)).astype(np.uint8) for rows in shown]
-    pairs = sfm_pairs.likely_pairs(descriptors)
+    pairs = sfm.likely_pairs(descriptors)
     assert all(0 <= before < later < 2 * PLACES for before, later in pairs)
-    assert len(set(pairs)) == len(pairs) <= 2 * PLACES * (len(sfm_pairs.DISTANCES) + sfm_pairs.ALIKE)
+    assert len(set(pairs)) == len(pairs) <= 2 * PLACES * (len(sfm.DISTANCES) + sfm.ALIKE)
     assert {(i, i + step) for step in (1, 2, 4, 8, 16) for i in range(2 * PLACES - step)} <= set(pairs)
     assert {(i, i + PLACES) for i in range(PLACES)} <= set(pairs)
-    assert sfm_pairs.likely_pairs(descriptors) == pairs
+    assert sfm.likely_pairs(descriptors) == pairs
 
 
 def test_many_photographs_are_matched_in_likely_pairs(shared: Path, tmp_path: Path, monkeypatch) -> None:
@@ -61,28 +59,14 @@ def test_many_photographs_are_matched_in_likely_pairs(shared: Path, tmp_path: Pa
         match(database, **options)
 
     monkeypatch.setattr(sfm, "ALL_PAIRS", 5)
-    monkeypatch.setattr(sfm_pairs, "ALIKE", 0)
+    monkeypatch.setattr(sfm, "ALIKE", 0)
     monkeypatch.setattr(pycolmap, "match_image_pairs", count)
     pictures = sfm.find_cameras(find_pictures(office_photos(shared, 8)), tmp_path / "sfm", Monitor())
     assert (len(pictures), len(pairs)) == (8, 7 + 6 + 4)
     assert center_errors(pictures, shared, list(range(8))).median() < 0.03
 
 
-def test_a_camera_that_only_turns_is_refused_and_nothing_is_kept(shared: Path, tmp_path: Path) -> None:
-    pytest.importorskip("pycolmap")
-    wide = np.array(Image.open(office_photos(shared, 9)[8]).resize((1080, 720)))
-    row, column = np.mgrid[:300, :400]
-    views = []
-    for turn in np.linspace(-0.35, 0.35, 8):
-        x, z = (column - 200) * np.cos(turn) + 400 * np.sin(turn), 400 * np.cos(turn) - (column - 200) * np.sin(turn)
-        places = np.round((row - 150) / z * 400 + 360), np.round(x / z * 400 + 540)
-        views.append(wide[places[0].clip(0, 719).astype(int), places[1].clip(0, 1079).astype(int)])
-    with pytest.raises(ValueError, match=r"cannot find the cameras of these 8 images.*rather than turning on the spot"):
-        sfm.find_cameras(find_pictures(views), tmp_path / "sfm", Monitor())
-    assert not (tmp_path / "sfm").exists()
-
-
-def test_copies_count_once_and_parts_are_named(photos: Path, tmp_path: Path, monkeypatch, caplog) -> None:
+def test_parts_are_named(photos: Path, tmp_path: Path, monkeypatch, caplog) -> None:
     """By a finished folder of four photographs, of which three were placed."""
     kept, names = tmp_path / "sfm", [picture.name for picture in find_pictures(photos)]
     images = {f"{number:06d}.jpg": name for number, name in enumerate(names[:3])}
@@ -90,14 +74,11 @@ def test_copies_count_once_and_parts_are_named(photos: Path, tmp_path: Path, mon
     for file in (*model, *(f"images/{name}" for name in images)):
         (kept / file).parent.mkdir(parents=True, exist_ok=True)
         (kept / file).touch()
-    state = {"key": sfm._key(find_pictures(photos)), "images": images, "points": 100}
+    state = {"key": sfm._key(find_pictures(photos)), "images": images}
     (kept / "sfm.json").write_text(json.dumps(state | {"left_out": names[3:], "other_parts": [names[3:]]}))
     monkeypatch.setattr(sfm, "_solve", lambda *_: pytest.fail("computed again"))
     monkeypatch.setattr(sfm, "recording_pictures", lambda _: [])
-    (tmp_path / "more").mkdir()
-    shutil.copy(photos / "IMG_9.jpg", tmp_path / "more" / "same.jpg")
-    sfm.find_cameras(find_pictures([photos, tmp_path / "more"]), kept, Monitor())
-    assert "1 images are copies of others and are left out: same (as IMG_9)" in caplog.text
+    sfm.find_cameras(find_pictures(photos), kept, Monitor())
     assert "1 of 4 images overlap too little with the others" in caplog.text
     assert "1 of them form a separate part with no overlap with the 3 images used" in caplog.text
     assert "reconstruct that part separately: IMG_11" in caplog.text
@@ -123,23 +104,3 @@ def test_parts_share_no_image() -> None:
     ]
     found = sfm._parts(models)  # pyright: ignore[reportArgumentType]
     assert found == [{"a", "b", "c"}, {"d", "x", "y"}, {"z"}, set()]
-
-
-@pytest.mark.slow
-def test_turned_photographs_are_placed(shared: Path, tmp_path: Path) -> None:
-    """Every third lies on its side, without a word of it in its EXIF data: another lens, another size."""
-    pytest.importorskip("pycolmap")
-    pixels = [np.array(Image.open(path)) for path in office_photos(shared, 12)]
-    views = [np.rot90(image).copy() if i % 3 == 2 else image for i, image in enumerate(pixels)]
-    pictures = sfm.find_cameras(find_pictures(views), tmp_path / "sfm", Monitor())
-    assert len(pictures) == 12
-    assert center_errors(pictures, shared, list(range(12))).median() < 0.03
-
-
-@pytest.mark.slow
-def test_the_larger_of_two_scenes_is_taken_and_the_other_named(shared: Path, tmp_path: Path, caplog) -> None:
-    pytest.importorskip("pycolmap")
-    fox = sorted((shared / "data" / "ingp_fox" / "images").iterdir())[:10]
-    pictures = sfm.find_cameras(find_pictures([*fox, *office_photos(shared, 14)]), tmp_path / "sfm", Monitor())
-    assert [picture.name for picture in pictures] == [path.stem for path in office_photos(shared, 14)]
-    assert "10 of them form a separate part with no overlap with the 14 images used" in caplog.text

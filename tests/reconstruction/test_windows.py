@@ -16,10 +16,9 @@ from vg2gt.data import SyntheticScenes
 from vg2gt.geometry.alignment import align_cameras
 from vg2gt.metrics import psnr
 from vg2gt.reconstruction.pipeline import reconstruct_with
-from vg2gt.reconstruction.windows import capture
 from vg2gt.reconstruction.windows import run as windows_run
-from vg2gt.reconstruction.windows.capture import cut, window_size
-from vg2gt.reconstruction.windows.store import merge_windows
+from vg2gt.reconstruction.windows import store
+from vg2gt.reconstruction.windows.store import cut, merge_windows, window_size
 from vg2gt.runs.load import load_model
 
 BY_ITSELF = ["backend=custom", f"backend._target_={ByItself.__module__}.ByItself", "model=tiny_ungated"]
@@ -29,7 +28,7 @@ VIEWS = 14
 @pytest.fixture(autouse=True)
 def few_neighbours(monkeypatch) -> None:
     """Or windows of these few views would see all of them."""
-    monkeypatch.setattr(capture, "MARGIN", 1)
+    monkeypatch.setattr(store, "MARGIN", 1)
 
 
 @pytest.fixture(scope="module")
@@ -65,9 +64,12 @@ def close(ours, whole) -> None:
     assert_close(ours.cameras.world_to_camera, whole.cameras.world_to_camera, atol=1e-6, rtol=0)
 
 
-@pytest.mark.parametrize("window", [5, 8])
-def test_windows_give_the_gaussians_of_all_views_at_once(model, walk, whole, window) -> None:
-    close(reconstruct_with(model, walk, window=window), whole)
+def test_windows_give_the_gaussians_of_all_views_at_once(model, walk, whole, monkeypatch) -> None:
+    """Also where tokens are not kept, but made again."""
+    monkeypatch.setattr(windows_run, "TOKEN_BYTES", 0)
+    calls = model.backend._calls
+    close(reconstruct_with(model, walk, window=8), whole)
+    assert model.backend._calls == calls + 2 * len(cut(VIEWS, 8))
 
 
 def test_surfels_look_as_those_of_all_views_at_once(walk) -> None:
@@ -98,6 +100,8 @@ def test_windows_of_predicted_cameras_are_placed_in_one_frame(frames_of_walk, wa
 
 
 def test_an_interrupted_run_goes_on(model, walk, whole, tmp_path, monkeypatch) -> None:
+    """And not with the files of other views in the same folder."""
+    reconstruct_with(model, walk, window=5, max_images=10, window_folder=tmp_path / "windows")
     calls = model.backend._calls
     pool, pooled = model.fine.pool, []
 
@@ -115,18 +119,6 @@ def test_an_interrupted_run_goes_on(model, walk, whole, tmp_path, monkeypatch) -
     monkeypatch.setattr(model.fine, "pool", pool)
     close(reconstruct_with(model, walk, window=5, window_folder=tmp_path / "windows"), whole)
     assert model.backend._calls == calls + windows  # nothing ran again
-
-
-def test_tokens_that_are_not_kept_are_made_again(model, walk, whole, monkeypatch) -> None:
-    monkeypatch.setattr(windows_run, "TOKEN_BYTES", 0)
-    calls = model.backend._calls
-    close(reconstruct_with(model, walk, window=8), whole)
-    assert model.backend._calls == calls + 2 * len(cut(VIEWS, 8))
-
-
-def test_other_views_do_not_go_on_with_the_files_of_these(model, walk, whole, tmp_path) -> None:
-    reconstruct_with(model, walk, window=5, max_images=10, window_folder=tmp_path / "windows")
-    close(reconstruct_with(model, walk, window=5, window_folder=tmp_path / "windows"), whole)
 
 
 def test_merging_in_slabs_changes_nothing(model, walk, tmp_path, monkeypatch) -> None:
@@ -148,18 +140,16 @@ def test_windows_are_for_many_views_overlap_and_own_every_view_once() -> None:
         assert window_size(wanted, views) == size
     with pytest.raises(ValueError, match="at least 4"):
         window_size(3, 100)
-    for count in (5, 24, 25, 60, 131):
-        for size in (4, 5, 8, 24, 59):
-            windows = cut(count, size)
-            assert [view for w in windows for view in range(w.own.start, w.own.stop)] == list(range(count))
-            for window in windows:
-                views = window.views.tolist()
-                assert views == list(range(views[0], views[-1] + 1))
-                assert 0 <= views[0] <= views[-1] < count
-                assert window.own.stop - window.own.start <= size
-                assert views[window.inner] == list(range(window.own.start, window.own.stop))
-            for before, after in itertools.pairwise(windows):
-                assert len(set(before.views.tolist()) & set(after.views.tolist())) >= min(capture.MARGIN, count)
+    for count, size in itertools.product((5, 24, 25, 60, 131), (4, 5, 8, 24, 59)):
+        windows = cut(count, size)
+        assert [view for w in windows for view in w.views[w.inner].tolist()] == list(range(count))
+        for window in windows:
+            views = window.views.tolist()
+            assert views == list(range(views[0], views[-1] + 1))
+            assert 0 <= views[0] <= views[-1] < count
+            assert window.own.stop - window.own.start <= size
+        for before, after in itertools.pairwise(windows):
+            assert len(set(before.views.tolist()) & set(after.views.tolist())) >= min(store.MARGIN, count)
 
 
 def test_the_command_makes_windows_and_tiles_and_clears_up(walk, tmp_path, monkeypatch) -> None:

@@ -36,22 +36,11 @@ def fill(start: Start, room: int = ROOM) -> Gaussians:
     return fill_holes(start.gaussians, start.cameras, start.seen, start.renderer, views, side=4, room=room)
 
 
-def test_holes_are_covered_in_the_images_colours(holed: Start) -> None:
+def test_holes_are_covered_once_and_blocks_grow_to_the_room_there_is(holed: Start) -> None:
     assert holes(holed, holed.gaussians)[0] > 0.2
     filled = fill(holed)
     assert (holes(holed, filled) < 0.03).all()
-    before, after = (
-        (holed.renderer(g, holed.cameras.select(torch.tensor([0]))).color[0, 0] - holed.seen.images[0]).abs().mean()
-        for g in (holed.gaussians, filled)
-    )
-    assert after < 0.6 * before
-    old = len(holed.gaussians)
-    assert torch.equal(filled.means[:old], holed.gaussians.means)
-    assert torch.equal(filled.background, holed.gaussians.background)  # pyright: ignore
-
-
-def test_what_was_filled_is_not_filled_again_and_blocks_grow_to_the_room_there_is(holed: Start) -> None:
-    filled = fill(holed)
+    assert torch.equal(filled.means[: len(holed.gaussians)], holed.gaussians.means)
     once = len(filled) - len(holed.gaussians)
     covered = (holes(holed, holed.gaussians).sum() * holed.seen.depth[0].numel() / 16).round()
     assert 0 < once < 0.7 * float(covered)  # a Gaussian for each block of each view

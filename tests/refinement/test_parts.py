@@ -10,7 +10,6 @@ import torch
 from tests.refinement.conftest import VIEWS, Start
 from vg2gt.geometry.cameras import invert_rigid
 from vg2gt.refinement import RefinedScene, RefineLoss, RefineRates
-from vg2gt.refinement.density import prune
 from vg2gt.refinement.parameters import Parameters
 from vg2gt.refinement.refine import ViewOrder
 
@@ -24,16 +23,12 @@ def parameters(start: Start) -> Parameters:
     return Parameters(state, RefineRates(), PIXEL, DEPTH, torch.arange(VIEWS))
 
 
-def test_parameters_begin_with_the_scene(parameters: Parameters, start: Start) -> None:
+def test_parameters_begin_with_the_scene_and_cameras_move_by_pixels(parameters: Parameters, start: Start) -> None:
+    """A turn about the own centre by one pixel's angle; a shift by one pixel at the median depth."""
     scene = parameters.scene()
     for name in ("means", "scales", "opacities", "sh"):
         torch.testing.assert_close(getattr(scene.gaussians, name), getattr(start.gaussians, name))
     torch.testing.assert_close(scene.cameras.world_to_camera, start.cameras.world_to_camera)
-    torch.testing.assert_close(scene.cameras.intrinsics, start.cameras.intrinsics)
-
-
-def test_cameras_move_by_pixels(parameters: Parameters, start: Start) -> None:
-    """A turn about the own centre by one pixel's angle; a shift by one pixel at the median depth."""
     moves = parameters.values["cameras"].detach()
     moves[1, 1], moves[2, 3] = 1.0, 1.0
     found, before = parameters.scene().detach().cameras.world_to_camera[0], start.cameras.world_to_camera[0]
@@ -67,26 +62,20 @@ def test_steps_are_in_units_of_each_gaussian_and_finite(parameters: Parameters) 
     torch.testing.assert_close(moved, torch.full_like(moved, 0.5 * RefineRates().means), rtol=0.05, atol=1e-3)
 
 
-def test_rows_keep_what_adam_knows(parameters: Parameters) -> None:
+def test_what_is_transparent_is_removed_and_adam_keeps_what_it_knows_of_the_rest(parameters: Parameters) -> None:
     scene = parameters.scene().gaussians
     parameters.step(scene.means.square().sum() + scene.opacities.square().sum(), share=1.0)
     seen = parameters.optimizer.state[parameters.values["means"]]["exp_avg_sq"]
-    opacities = parameters.scene().gaussians.opacities.detach()
     assert (seen > 0).any()
-    rows = torch.tensor([5, 3, 3])
-    parameters.take(rows)
-    assert torch.equal(parameters.optimizer.state[parameters.values["means"]]["exp_avg_sq"], seen[rows])
-    assert torch.equal(parameters.scene().gaussians.opacities, opacities[rows])
+    parameters.values["opacities"].detach()[:10] = -6.0
+    opacities = parameters.scene().gaussians.opacities.detach()
+    parameters.prune()
+    assert torch.equal(parameters.optimizer.state[parameters.values["means"]]["exp_avg_sq"], seen[10:])
+    assert torch.equal(parameters.scene().gaussians.opacities, opacities[10:])
     assert parameters.step(parameters.scene().gaussians.means.sum(), share=1.0)
-
-
-def test_prune_removes_what_is_transparent(parameters: Parameters) -> None:
-    logits = parameters.values["opacities"].detach()
-    logits[:10] = -6.0
-    assert prune(parameters, 0.02) == 10
-    assert len(parameters.scene().gaussians) == len(logits) - 10
     parameters.values["opacities"].detach().fill_(-6.0)
-    assert prune(parameters, 0.02) == 0
+    parameters.prune()
+    assert len(parameters.scene().gaussians) == len(opacities) - 10
 
 
 @pytest.mark.parametrize(("views", "holdout"), [(12, 4), (20, None), (2, None)])
@@ -95,11 +84,10 @@ def test_views_are_dealt_alike_and_left_out_in_turns(views: int, holdout: int | 
     dealt: Counter[int] = Counter()
     left_out: Counter[int] = Counter()
     for _ in range(40):
-        for _ in range(20):
-            hand = order.deal(3).tolist()
-            assert len(set(hand)) == len(hand) == min(3, len(order.trained))
-            assert not set(hand) & set(order.left_out.tolist())
-            dealt.update(hand)
+        for _ in range(60):
+            (view,) = order.deal().tolist()
+            assert view not in order.left_out
+            dealt[view] += 1
         left_out.update(order.left_out.tolist())
         order.next_round()
     assert set(dealt) == set(order.trained.tolist())
@@ -113,17 +101,13 @@ def test_a_perfect_view_has_no_loss(start: Start) -> None:
     terms = RefineLoss(normal_render=0, normal_decoded=0).of_views(rendered, start.cameras, seen, 1.0)
     assert set(terms) == {"color_l1", "ssim", "depth_consistency"}
     assert all(abs(float(term)) < 1e-4 for term in terms.values())
+    assert not RefineLoss().with_geometry(0).needs_geometry
+    size = start.gaussians.scales.max(-1).values
+    priced = RefineLoss(opacity=0.1, scale=2.0)
+    terms = priced.of_gaussians(start.gaussians, size / 2)
+    assert float(priced.total(terms)) == pytest.approx(2 + 0.1 * float(start.gaussians.opacities.mean()))
     off = replace(rendered, depth=1.1 * rendered.depth)
     moved = RefineLoss().of_views(off, start.cameras, seen, 2.0)["depth_consistency"]
     hits = (rendered.depth > 0) & (rendered.alpha > 0.5)
     trust = torch.where(hits[0], seen.depth_conf, 0)
     assert float(moved) == pytest.approx(float((0.05 * rendered.depth[0] * trust).sum() / trust.sum()), rel=1e-3)
-
-
-def test_weights_decide_which_terms_there_are(start: Start) -> None:
-    size = start.gaussians.scales.max(-1).values
-    assert RefineLoss().of_gaussians(start.gaussians, size) == {}
-    terms = RefineLoss(opacity=0.1, scale=2.0).of_gaussians(start.gaussians, size / 2)
-    assert float(terms["scale"]) == pytest.approx(1.0)
-    assert float(RefineLoss(opacity=0.1, scale=2.0).total(terms)) == pytest.approx(2 + 0.1 * float(terms["opacity"]))
-    assert not RefineLoss(depth_consistency=0, normal_render=0, normal_decoded=0).needs_geometry

@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from vg2gt.geometry.cameras import scale_translations
 from vg2gt.types import Cameras, Geometry
 from vg2gt.uncertainty import Status, pixel_evidence, point_support
 from vg2gt.uncertainty.evidence import EVIDENCE
@@ -71,9 +72,7 @@ def test_the_differences_are_their_upper_quartile_and_unknown_without_overlap(ca
 def test_it_does_not_depend_on_the_unit(cameras: Cameras) -> None:
     seen = geometry(cameras)
     seen.depth[0, 0, :20] *= 1.3
-    moved = cameras.world_to_camera.clone()
-    moved[..., :3, 3] *= 7
-    larger = Geometry(7 * seen.depth, seen.depth_conf, Cameras(moved, cameras.intrinsics, SIZE), seen.scale)
+    larger = Geometry(7 * seen.depth, seen.depth_conf, scale_translations(cameras, torch.tensor([7.0])), seen.scale)
     for mine, theirs in zip(pixel_evidence(seen), pixel_evidence(larger), strict=True):
         torch.testing.assert_close(mine, theirs, atol=1e-4, rtol=1e-4)
 

@@ -13,16 +13,7 @@ from typing import TYPE_CHECKING
 from vg2gt.cli.arguments import OVERRIDES, add_common_flags, flag_parser, list_of_names, listing, separate
 from vg2gt.cli.errors import errors_in_one_line
 from vg2gt.cli.refine import options_for
-from vg2gt.reconstruction.output_names import (
-    DEFAULT,
-    LARGE,
-    OUTPUTS,
-    PREDICTED,
-    REFINED,
-    SFM,
-    TILES,
-    WINDOWS,
-)
+from vg2gt.reconstruction.output_names import DEFAULT, LARGE, OUTPUTS, PREDICTED, SFM, TILES, WINDOWS
 
 POSES = (
     "cameras from files next to the images, or from structure from motion (kept in DIR/sfm); auto: the first of these "
@@ -126,8 +117,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     print(trust_line(scene))
     print(f"weights: {figures['weights']}; cameras: {scene.cameras_from or PREDICTED}")
     print(f"seconds: {times}; peak memory {cost['peak_memory_mib']} MiB")
-    more = [] if how is None else [REFINED]
-    print(f"written: {', '.join(str(folder / name) for name in (*options.save, *more))}")
+    print(f"written: {', '.join(str(folder / name) for name in options.save)}")
 
 
 def _check(options: argparse.Namespace, overrides: Sequence[str]) -> None:
@@ -136,11 +126,11 @@ def _check(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     from vg2gt.reconstruction.outputs import check_folder, check_outputs
     from vg2gt.reconstruction.pictures import check_limit
     from vg2gt.reconstruction.trust import check_trust
-    from vg2gt.reconstruction.windows.capture import window_size
+    from vg2gt.reconstruction.windows.store import window_size
     from vg2gt.runs.load import backend_class
 
     check_outputs(options.save)
-    check_folder(options.out, [*options.save, REFINED], options.overwrite)
+    check_folder(options.out, options.save, options.overwrite)
     check_limit(options.max_images)
     window_size(options.window, 0)
     check_trust(options.min_confidence, options.drop)
@@ -178,7 +168,7 @@ def _scene(options: argparse.Namespace, ready: LoadedModel, monitor: Monitor) ->
 def _refinement(scene: Scene, steps: int | None) -> RefineOptions | None:
     """Refinement options; None without refinement: ``steps`` is 0, or not given for recordings and long captures."""
     from vg2gt.reconstruction.refined import refinement_of
-    from vg2gt.reconstruction.windows.capture import AUTOMATIC
+    from vg2gt.reconstruction.windows.store import AUTOMATIC
 
     many = len(scene.names) > AUTOMATIC  # refinement holds all images in memory
     if steps == 0 or (steps is None and (many or refinement_of(scene) == "default")):

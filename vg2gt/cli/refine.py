@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from vg2gt.cli.arguments import add_common_flags, flag_parser, listing, separate
 from vg2gt.cli.errors import errors_in_one_line
-from vg2gt.reconstruction.output_names import DEFAULT, OUTPUTS, REFINED
+from vg2gt.reconstruction.output_names import DEFAULT, OUTPUTS
 
 if TYPE_CHECKING:
     from vg2gt.reconstruction.scene import Scene
@@ -50,7 +50,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
 
     check_outputs(options.save)
     out = Path(options.out or Path(options.scene) / "refined")
-    check_folder(out, [*options.save, REFINED], options.overwrite)
+    check_folder(out, options.save, options.overwrite)
     refine_options("default", overrides)  # reports wrong options before anything is read
     device = choose_device(options.device)
     with Monitor(show=not options.quiet, device=device) as monitor, memory_advice(ADVICE):
@@ -60,7 +60,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
         scene = refine_scene(scene, how, monitor)
         folder = write_outputs(scene, out, options.save, overwrite=options.overwrite, monitor=monitor)
     print(*refinement_lines(scene), sep="\n")
-    print(f"written: {', '.join(str(folder / name) for name in (*options.save, REFINED))}")
+    print(f"written: {', '.join(str(folder / name) for name in options.save)}")
 
 
 def options_for(scene: Scene, overrides: Sequence[str] = (), **changes: float | None) -> RefineOptions:

@@ -22,7 +22,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         "--cameras",
         required=True,
         metavar="PATH",
-        help="cameras.json (ours or of 3DGS), transforms.json, or a COLMAP model's folder",
+        help="cameras.json, transforms.json, or a COLMAP model's folder",
     )
     add("--out", required=True, metavar="DIR", help="where to write")
     add("--depth", choices=("median", "expected"), default="median", help="expected requires --mode rasterized")

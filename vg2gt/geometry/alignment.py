@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import torch
 from torch import Tensor
 
 from vg2gt.geometry.cameras import camera_centers, compose
-from vg2gt.types import Cameras, TensorRecord
+from vg2gt.geometry.rotations import matrix_to_quat, multiply_quats
+from vg2gt.geometry.spherical_harmonics import rotation_of_coefficients
+from vg2gt.types import Cameras, Gaussians, TensorRecord
 
 SUBSAMPLE = 64
 MIN_DEPTH = 0.01
@@ -102,6 +104,18 @@ class Similarity(TensorRecord):
         top = torch.cat((rotation, translation), -1)
         pose = torch.cat((top, cameras.world_to_camera[..., 3:, :]), -2)
         return Cameras(pose, cameras.intrinsics, cameras.size)
+
+    def apply_gaussians(self, gaussians: Gaussians) -> Gaussians:
+        """Moves the Gaussians of one scene (B = 1), computed in float64."""
+        move, dtype = self.to(gaussians.means.device).map(Tensor.double), gaussians.means.dtype
+        degree = round(gaussians.sh.shape[1] ** 0.5) - 1
+        return replace(
+            gaussians,
+            means=move.apply(gaussians.means[None].double())[0].to(dtype),
+            quats=multiply_quats(matrix_to_quat(move.rotation), gaussians.quats.double()).to(dtype),
+            scales=(gaussians.scales.double() * move.scale).to(dtype),
+            sh=(rotation_of_coefficients(move.rotation[0], degree) @ gaussians.sh.double()).to(dtype),
+        )
 
 
 def align_cameras(

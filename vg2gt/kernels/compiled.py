@@ -95,7 +95,7 @@ class _Implementation(CompileResultCacheImpl):
 
 
 class _Cache(FunctionCache):
-    """numba's cache, but a full disk is no error."""
+    """numba's cache, but a full disk or a damaged file leads to another compilation instead of an error."""
 
     _impl_class = _Implementation
 
@@ -103,6 +103,16 @@ class _Cache(FunctionCache):
         super().__init__(function)
         # numba numbers its files: two processes could use one name for two signatures and run each other's code
         self._cache_file._data_name_pattern = f"{self._impl.filename_base}.{{number:d}}-{secrets.token_hex(8)}.nbc"
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Returns the cached kernel for these arguments, or None."""
+        try:
+            return super().load_overload(sig, target_context)
+        except Exception as error:  # whatever unpickling raises
+            log.warning("damaged compiled kernel in %s (%s): compiling it again", self.cache_path, error)
+            with suppress(OSError):
+                self.flush()
+            return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Saves the kernel for these arguments, if the disk has room."""

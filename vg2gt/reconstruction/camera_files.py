@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -100,25 +101,20 @@ def interpolate(cameras: Sequence[NamedCamera], between: int) -> list[NamedCamer
     sizes = {(camera.width, camera.height) for camera in cameras}
     if len(sizes) > 1:
         raise ValueError(f"cameras of one image size are needed, these have {sorted(sizes)}; choose some of one size")
-    times = np.arange(len(cameras), dtype=np.float64)
+    times = np.arange(len(cameras))
     poses = np.stack([invert_pose(camera.world_to_camera) for camera in cameras])
     positions = CubicSpline(times, poses[:, :3, 3], bc_type="natural")
     rotations = RotationSpline(times, Rotation.from_matrix(poses[:, :3, :3]))
-    intrinsics = np.stack([camera.intrinsics for camera in cameras])
-    path = []
-    for number in range((len(cameras) - 1) * (between + 1) + 1):
-        left, step = divmod(number, between + 1)
-        if step == 0:  # exactly the given camera, free of spline rounding
-            path.append(cameras[left])
-            continue
-        time = left + step / (between + 1)
-        pose = np.eye(4)
-        pose[:3, :3] = rotations(time).as_matrix()
-        pose[:3, 3] = positions(time)
-        share = time - left
-        k = (1 - share) * intrinsics[left] + share * intrinsics[left + 1]
-        name = f"{view_stem(cameras[left].name)}-{step:03d}"
-        path.append(NamedCamera(name, cameras[0].width, cameras[0].height, k, invert_pose(pose)))
+    path = [cameras[0]]
+    for left, (one, other) in enumerate(itertools.pairwise(cameras)):
+        for step in range(1, between + 1):
+            share = step / (between + 1)
+            pose = np.eye(4)
+            pose[:3, :3], pose[:3, 3] = rotations(left + share).as_matrix(), positions(left + share)
+            intrinsics = (1 - share) * one.intrinsics + share * other.intrinsics
+            name = f"{view_stem(one.name)}-{step:03d}"
+            path.append(NamedCamera(name, one.width, one.height, intrinsics, invert_pose(pose)))
+        path.append(other)  # exactly, free of spline rounding
     return path
 
 

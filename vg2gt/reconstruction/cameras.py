@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 import logging
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal, get_args
@@ -18,9 +18,7 @@ from vg2gt.reconstruction.monitor import Monitor
 from vg2gt.reconstruction.pictures import (
     ImagesLike,
     Picture,
-    as_items,
     check_pictures,
-    existing_path,
     find_pictures,
     without_copies,
 )
@@ -38,7 +36,7 @@ def pictures_for(
     poses: Poses = "auto",
     *,
     max_images: int | None = None,
-    sfm_folder: Path | None = None,
+    sfm_folder: str | Path | None = None,
     monitor: Monitor | None = None,
 ) -> Iterator[list[Picture]]:
     """Yields the pictures to reconstruct, with cameras if the backbone takes any; they can be read inside the block.
@@ -97,16 +95,16 @@ def pictures_for(
         place = {picture.name: number for number, picture in enumerate(pictures)}
         if all(picture.path is not None for picture in pictures):  # so that the order of the files does not matter
             pictures = sorted(pictures, key=lambda picture: by_number(str(picture.path)))
-        found = find_cameras(pictures, sfm_folder or Path(temporary) / "sfm", monitor or Monitor())
+        found = find_cameras(pictures, Path(sfm_folder or f"{temporary}/sfm"), monitor or Monitor())
         yield sorted(found, key=lambda picture: place[picture.name])
 
 
-def check_inputs(backend: type, images: ImagesLike, poses: Poses) -> None:
+def check_inputs(backend: type, images: Sequence[str], poses: Poses) -> None:
     """Checks the images, before anything is built: that they can be read, and have or can get what a backend needs.
 
     Args:
         backend: class of the backend.
-        images: input of the reconstruction.
+        images: files and folders.
         poses: see :func:`pictures_for`.
 
     Raises:
@@ -114,8 +112,6 @@ def check_inputs(backend: type, images: ImagesLike, poses: Poses) -> None:
         ImportError: if a package is not installed; the message says what needs it and how to install it.
         ValueError: if there are no pictures, or they lack depth.
     """
-    for item in as_items(images):
-        existing_path(item)
     if getattr(backend, "needs_depth", False) and given_pictures(images, depth=True) is None:
         raise ValueError(_no_depth(backend.__name__, images))
     check_pictures(images)

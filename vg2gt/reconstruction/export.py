@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from vg2gt.data.base import DataError
 from vg2gt.geometry.cameras import project
 from vg2gt.io.files import write_bytes
 from vg2gt.io.image_files import orientation
@@ -51,15 +50,13 @@ class ExportedViews:
         folder.mkdir(parents=True)
         for name, picture, image in zip(self.names, self.pictures, scene.images, strict=True):
             path = folder / name
-            suffix = path.suffix.lower()
             if picture is not None:
-                file = None if picture.lens else picture.path
-                if file is not None and file.suffix.lower() == suffix and _is_upright(file):
-                    shutil.copyfile(file, path)
+                if picture.path is not None and not picture.lens and orientation(picture.path, "") == 1:
+                    shutil.copyfile(picture.path, path)
                     continue
                 image = picture.read(picture.size).images[0]
-            kind = "JPEG" if suffix in (".jpg", ".jpeg") else "PNG"
-            options = {"quality": _QUALITY, "subsampling": 0} if kind == "JPEG" else {}
+            is_jpeg = path.suffix.lower() in (".jpg", ".jpeg")
+            kind, options = ("JPEG", {"quality": _QUALITY, "subsampling": 0}) if is_jpeg else ("PNG", {})
             write_bytes(path, encode_image(to_pixels(image), kind, **options))
 
     def observations(self, scene: Scene) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
@@ -95,25 +92,15 @@ def exported_views(scene: Scene) -> ExportedViews:
     """Returns the views with whole photographs if known, else with the images at the working size."""
     named = scene.named_cameras()
     poses = torch.from_numpy(np.stack([camera.world_to_camera for camera in named]))
-    small = [(camera.height, camera.width) for camera in named]
-    photos = [camera.photo for camera in named]
-    if None in photos:
+    if named[0].photo is None:
         log.warning("photographs of a scene read from a folder are not known: images are exported at the working size")
-    sizes = tuple((p.height, p.width) if p is not None else s for p, s in zip(photos, small, strict=True))
-    matrices = np.stack([c.intrinsics if p is None else p.intrinsics for c, p in zip(named, photos, strict=True)])
-    names = [camera.name if photo is None else photo.name for camera, photo in zip(named, photos, strict=True)]
+    shown = [camera.photo or camera for camera in named]
+    sizes = tuple((each.height, each.width) for each in shown)
+    names = [each.name for each in shown]
     if len({name.lower() for name in names}) < len(names):  # photographs of several folders
         names = [f"{camera.name[:-4]}{Path(name).suffix}" for camera, name in zip(named, names, strict=True)]
-    cameras = Cameras(poses[None], torch.from_numpy(matrices)[None], sizes[0])
-    pictures = tuple(None if photo is None else scene.pictures[view] for view, photo in enumerate(photos))
-    return ExportedViews(cameras, sizes, tuple(names), pictures)
-
-
-def _is_upright(path: Path) -> bool:
-    try:
-        return orientation(path, "") == 1
-    except DataError:
-        return False
+    cameras = Cameras(poses[None], torch.from_numpy(np.stack([each.intrinsics for each in shown]))[None], sizes[0])
+    return ExportedViews(cameras, sizes, tuple(names), scene.pictures if named[0].photo else (None,) * len(named))
 
 
 def _fewer(owner: NDArray[np.int64], own: NDArray[np.bool_]) -> NDArray[np.int64]:

@@ -11,9 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from vg2gt.geometry.alignment import Similarity, align_cameras
-from vg2gt.geometry.rotations import matrix_to_quat, multiply_quats
-from vg2gt.geometry.spherical_harmonics import rotation_of_coefficients
-from vg2gt.types import Cameras, Gaussians
+from vg2gt.types import Cameras
 
 log = logging.getLogger(__name__)
 
@@ -112,20 +110,6 @@ def upright_rotation(poses: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.diag([1.0, -1, -1])
     cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
     return np.eye(3) + cross + cross @ cross / (1 + cosine)
-
-
-def moved_gaussians(gaussians: Gaussians, move: Similarity) -> Gaussians:
-    """Moves one scene's Gaussians by a similarity (B = 1), computed in float64."""
-    move = move.to(gaussians.means.device)
-    turn, dtype = move.rotation[0], gaussians.means.dtype
-    degree = round(gaussians.sh.shape[1] ** 0.5) - 1
-    return replace(
-        gaussians,
-        means=move.apply(gaussians.means[None].double())[0].to(dtype),
-        quats=multiply_quats(matrix_to_quat(turn)[None], gaussians.quats.double()).to(dtype),
-        scales=(gaussians.scales.double() * move.scale).to(dtype),
-        sh=(rotation_of_coefficients(turn, degree) @ gaussians.sh.double()).to(dtype),
-    )
 
 
 def moved_cameras(cameras: Cameras, move: Similarity, frame: SceneFrame) -> tuple[Cameras, Tensor]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from vg2gt.data.base import DataError, Frames
 from vg2gt.data.sources.colmap_model import COLMAP, model_folder_of
 from vg2gt.data.sources.files import FileSource
 from vg2gt.data.sources.nerfstudio import Nerfstudio, transforms_files
+from vg2gt.data.sources.parsing import IMAGE_SUFFIXES
 from vg2gt.data.sources.phone import app_of
 from vg2gt.data.sources.rgbd import RGBDFolder
 from vg2gt.data.sources.undistortion import size_on_disk, undistortion_of
@@ -28,13 +29,11 @@ from vg2gt.reconstruction.pictures import (
     ImagesLike,
     Picture,
     as_items,
-    check_limit,
     evenly,
     existing_path,
     frame_of,
     image_files,
     image_folders,
-    is_image_folder,
     mask_for,
     shrunk,
     with_unique_names,
@@ -66,13 +65,12 @@ def given_pictures(images: ImagesLike, max_images: int | None = None, depth: boo
         ImportError: if pycolmap is needed and not installed.
         ValueError: if a file of cameras is damaged, or belongs to other images.
     """
-    check_limit(max_images)
     items = as_items(images)
     if not all(isinstance(item, (str, Path)) for item in items):
         return None
     paths = [existing_path(item) for item in items]
     found: list[Picture] = []
-    for folder, files in _by_folder(paths):
+    for folder, files in _by_folder(paths).items():
         own = _given(folder, depth)
         if own is None:
             return None
@@ -100,14 +98,15 @@ def recording_pictures(source: FileSource) -> list[Picture]:
             return source.load_whole(scene, frame)
 
         row = index.row(frame)
+        color = index.color[row]
         return Picture(
-            index.color[row].stem,
+            color.stem,
             index.own_size(row),
             read,
             kind,
             source.has_depth,
             source.point_depths(scene, frame) if isinstance(source, COLMAP) else None,
-            path=index.color[row],
+            path=color if color.is_file() and color.suffix.lower() in IMAGE_SUFFIXES else None,
             pose=index.world_to_camera[row],
             is_metric=metric,
             lens=index.lens(row),
@@ -117,17 +116,15 @@ def recording_pictures(source: FileSource) -> list[Picture]:
     return [picture(frame) for frame in source.frames(scene) if frame not in tests]
 
 
-def _by_folder(paths: Sequence[Path]) -> Iterator[tuple[Path, list[Path] | None]]:
+def _by_folder(paths: Sequence[Path]) -> dict[Path, list[Path] | None]:
     """Groups inputs by folder: a folder or recording as a whole (None), single images by their folder."""
-    files: dict[Path, list[Path]] = {}
-    for path in paths:
-        if path.is_file() and app_of(path) is None:
-            files.setdefault(path.parent, []).append(path)
+    groups: dict[Path, list[Path] | None] = {}
     for path in paths:
         if path.is_dir() or app_of(path):
-            yield path, None
-        elif path.parent in files:
-            yield path.parent, files.pop(path.parent)
+            groups[path] = None
+        elif (files := groups.setdefault(path.parent, [])) is not None:
+            files.append(path)
+    return groups
 
 
 def _only(pictures: list[Picture], files: list[Path], folder: Path) -> list[Picture]:
@@ -141,33 +138,23 @@ def _only(pictures: list[Picture], files: list[Path], folder: Path) -> list[Pict
 
 
 def _given(folder: Path, depth: bool) -> list[Picture] | None:
-    for place, images, sure in _places(folder):
+    """Returns the pictures of a folder or recording with the cameras in there, or else one folder up."""
+    inside = image_folders(folder) if folder.is_dir() else []
+    places = [(folder, inside[0].name if inside else ".")]
+    if not inside and (folder / "dense" / "images").is_dir():  # a COLMAP workspace without its distorted originals
+        places.insert(0, (folder / "dense", "images"))
+    if folder.is_dir():
+        places.append((folder.resolve().parent, folder.resolve().name))
+    for place, images in places:
         pictures = None
-        try:
-            if not depth and (place / _CAMERAS).is_file():
-                pictures = _from_cameras_json(place / _CAMERAS, place / images)
-            if pictures is None and (source := _source(place, images, depth)) is not None:
-                pictures = recording_pictures(source)
-        except DataError as error:
-            if sure:
-                raise
-            log.warning("cameras in %s are ignored for the images in %s: %s", place, folder, error)
-            continue
+        if not depth and (place / _CAMERAS).is_file():
+            pictures = _from_cameras_json(place / _CAMERAS, place / images)
+        if pictures is None and (source := _source(place, images, depth)) is not None:
+            pictures = recording_pictures(source)
         if pictures is not None:
             _name_missing(pictures, place / images)
             return pictures
     return None
-
-
-def _places(folder: Path) -> Iterator[tuple[Path, str, bool]]:
-    """Yields folders that may hold a folder's cameras, the path of the images from there, and whether they must fit."""
-    inside = image_folders(folder) if folder.is_dir() else []
-    if (folder / "dense" / "images").is_dir() and not inside:  # a workspace without its distorted originals
-        yield folder / "dense", "images", True
-    yield folder, inside[0].name if inside else ".", True
-    above = folder.resolve().parent
-    if folder.is_dir():
-        yield above, folder.resolve().name, is_image_folder(folder.name)
 
 
 def _source(folder: Path, images: str, depth: bool) -> FileSource | None:
@@ -178,14 +165,13 @@ def _source(folder: Path, images: str, depth: bool) -> FileSource | None:
             return Nerfstudio(str(folder), depth=with_depth)
     if not depth and model_folder_of(folder) is not None:
         return COLMAP(str(folder), images=images)
+    has_depth = (folder / "depth").is_dir() or any(folder.glob("frame-*.color.*"))
+    poses = not depth and any((folder / name).exists() for name in ("poses.txt", "pose", "poses"))
     if app_of(folder) is not None or any(folder.glob(f"*{R3D}")):
-        # Without depth, colour keeps its full size: a phone's depth is coarse.
-        return RGBDFolder(str(folder), holdout=None, depth=depth)
-    if (folder / "depth").is_dir() or any(folder.glob("frame-*.color.*")):
-        return RGBDFolder(str(folder), holdout=None)
-    if not depth and ((folder / "poses.txt").is_file() or (folder / "pose").is_dir() or (folder / "poses").is_dir()):
-        return RGBDFolder(str(folder), holdout=None, depth=False)
-    return None
+        has_depth = depth  # otherwise colour keeps its full size: a phone's depth is coarse
+    elif not (has_depth or poses):
+        return None
+    return RGBDFolder(str(folder), holdout=None, depth=has_depth)
 
 
 def _name_missing(pictures: list[Picture], folder: Path) -> None:

@@ -39,14 +39,12 @@ class Views:
         names: one per view, unique.
         hints: known inputs, on the CPU: at least the order of the pictures.
         mask: ``[V, H, W]`` float32 in [0, 1], pixel weights (alpha, mask images); None: all pixels count.
-        pictures: source pictures, one per view.
     """
 
     images: Tensor
     names: tuple[str, ...]
     hints: Hints
     mask: Tensor | None = None
-    pictures: tuple[Picture, ...] = ()
 
 
 def working_size(
@@ -106,8 +104,7 @@ def load_views(pictures: Sequence[Picture], size: tuple[int, int], monitor: Moni
         cameras = Cameras(given_poses(pictures)[None], joined.intrinsics[None], size)
         depth = joined.depth[None] if all(picture.has_depth for picture in pictures) else None
         hints = Hints(depth, cameras, (source,), hints.frame_ids, depth_range(pictures), mask)
-    names = tuple(picture.name for picture in pictures)
-    return Views(joined.images, names, hints, joined.mask, tuple(pictures))
+    return Views(joined.images, tuple(picture.name for picture in pictures), hints, joined.mask)
 
 
 def photo_of(camera: NamedCamera, picture: Picture) -> Photo:

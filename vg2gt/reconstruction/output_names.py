@@ -28,4 +28,3 @@ OUTPUTS = {
 TILES, LARGE = "tiles", 1_000_000  # the command adds tiles if there are more Gaussians
 DEFAULT = ("scene.ply", "cameras.json", "views.npz", "report.png", "report.json")
 PREDICTED = "predicted by the backbone"  # entry for such cameras in a report
-REFINED = "refine.png"  # written for every refined scene: views before and after

@@ -36,9 +36,9 @@ from vg2gt.io.video import write_video
 from vg2gt.reconstruction.camera_files import view_stem
 from vg2gt.reconstruction.export import exported_views
 from vg2gt.reconstruction.monitor import Monitor
-from vg2gt.reconstruction.output_names import DEFAULT, MAPS, OUTPUTS, PREDICTED, REFINED
+from vg2gt.reconstruction.output_names import DEFAULT, MAPS, OUTPUTS, PREDICTED
 from vg2gt.reconstruction.pictures import spread
-from vg2gt.reconstruction.refined import before_and_after, refinement_figures
+from vg2gt.reconstruction.refined import refinement_figures
 from vg2gt.reconstruction.trust import trust_figures, trust_picture
 from vg2gt.uncertainty import Status, point_support
 
@@ -74,10 +74,8 @@ def check_folder(folder: str | Path, outputs: Sequence[str], overwrite: bool) ->
     """
     folder = Path(folder).expanduser()
     place = next(place for place in (folder, *folder.parents) if place.exists())
-    if not place.is_dir():
-        raise PermissionError(f"the output folder {folder} cannot be made ({place} is a file); choose another")
-    if not os.access(place, os.W_OK | os.X_OK):
-        raise PermissionError(f"the output folder {folder} is not writable; choose another")
+    if not (place.is_dir() and os.access(place, os.W_OK | os.X_OK)):
+        raise PermissionError(f"the output folder {folder} cannot be written to ({place}); choose another")
     there = [target for target in (folder / _target(output) for output in outputs) if target.exists()]
     if there and not overwrite:
         raise FileExistsError(f"{there[0]} already exists; choose another folder or add --overwrite")
@@ -111,8 +109,7 @@ def write_outputs(
         ValueError: if an output is unknown.
     """
     check_outputs(outputs)
-    pictures = [REFINED] if scene.refined is not None else []
-    folder = check_folder(folder, [*outputs, *pictures], overwrite)
+    folder = check_folder(folder, outputs, overwrite)
     monitor = monitor or Monitor()
     plain = [output for output in outputs if output in _WRITERS]
     if plain:
@@ -120,8 +117,6 @@ def write_outputs(
             for output in plain:
                 _WRITERS[output](scene, folder / _target(output))
                 advance()
-    for name in pictures:
-        write_png(folder / name, before_and_after(scene))
     sinks = [map_folder(folder, output) for output in outputs if output in MAPS]
     if meshes := [folder / output for output in outputs if output.startswith("mesh")]:
         sinks.append(mesh_fusion(scene, meshes, mesh_voxel))
@@ -258,27 +253,18 @@ def _views(scene: Scene, path: Path) -> None:
     ``names [V]`` are those of the views; ``images [V, H, W, 3]`` is uint8; ``depth``, ``depth_conf`` and, if known,
     ``mask`` and ``error`` are float32 ``[V, H, W]``; ``support [V, H, W]``, if known, is uint8.
     """
-    buffer = io.BytesIO()
     images = np.stack([to_pixels(image) for image in scene.images])
-    arrays = {
-        "names": np.array(scene.names),
-        "images": images,
-        "depth": scene.depth.numpy(),
-        "depth_conf": scene.depth_conf.numpy(),
-    }
-    for name in ("mask", "error", "support"):
-        if (values := getattr(scene, name)) is not None:
-            arrays[name] = values.numpy()
-    np.savez_compressed(buffer, **arrays)  # pyright: ignore[reportArgumentType]
+    maps = {name: getattr(scene, name) for name in ("depth", "depth_conf", "mask", "error", "support")}
+    arrays = {name: values.numpy() for name, values in maps.items() if values is not None}
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, names=np.array(scene.names), images=images, **arrays)  # pyright: ignore[reportArgumentType]
     write_bytes(path, buffer.getvalue())
 
 
 def _colmap(scene: Scene, target: Path) -> None:
-    exported = exported_views(scene)
-    points, sources = scene.points(), exported.observations(scene)
-    model = colmap_from_views(
-        exported.cameras, exported.names, points.positions, points.colors, sources, exported.sizes
-    )
+    exported, points = exported_views(scene), scene.points()
+    seen = exported.observations(scene)
+    model = colmap_from_views(exported.cameras, exported.names, points.positions, points.colors, seen, exported.sizes)
     with whole_folder(target) as folder:
         exported.write_images(scene, folder / "images")
         write_colmap(folder / "sparse" / "0", model)
@@ -286,7 +272,7 @@ def _colmap(scene: Scene, target: Path) -> None:
 
 def _nerfstudio(scene: Scene, target: Path) -> None:
     exported = exported_views(scene)
-    poses, intrinsics = (t[0].double().numpy() for t in (exported.cameras.world_to_camera, exported.cameras.intrinsics))
+    poses, intrinsics = exported.cameras.world_to_camera[0].numpy(), exported.cameras.intrinsics[0].numpy()
     frames = [
         TransformsFrame(f"images/{name}", pose, Lens.from_intrinsics(k, size))
         for name, pose, k, size in zip(exported.names, poses, intrinsics, exported.sizes, strict=True)

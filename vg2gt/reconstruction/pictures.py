@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+import itertools
 import logging
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -39,7 +40,6 @@ _HOLDS_PICTURES = (*IMAGE_SUFFIXES, *HEIC_SUFFIXES, R3D)
 VIDEO_FRAMES = 32  # frames taken from a video by default
 IN_MEMORY = 100  # maximum number of video frames kept in memory; with more, each is decoded on demand
 IMAGE_FOLDERS = ("images", "color", "rgb", "image", "input")
-_NO_PHOTOGRAPHS = ("masks", "depth", "depths", "color", "normals", "sfm", "sparse", "colmap", "nerfstudio")
 SFM_SOURCE = "structure from motion"  # prefix of the source of cameras found by it
 UNKNOWN_LENS = "unknown"  # lens of images that structure from motion has undistorted
 
@@ -91,16 +91,18 @@ def find_pictures(images: ImagesLike, max_images: int | None = None) -> list[Pic
         FileNotFoundError: if a path does not exist.
         ValueError: if there is no picture (the message names where was searched), or a file cannot be read.
     """
-    check_limit(max_images)
     chosen = [picture for item in as_items(images) for picture in _pictures(item, max_images)]
     if not chosen:
         raise ValueError("there are no images to reconstruct; give image files, a folder of them, or a video")
     taken = evenly(chosen, max_images)
-    _check_masks([picture.path for picture in taken if picture.path is not None])
+    photos = [picture.path for picture in taken if picture.path is not None]
+    masks = {place / MASKS for photo in photos for place in (photo.parent, photo.parent.parent)}
+    if known := sorted(folder for folder in masks if folder.is_dir()):
+        warn_without_mask([photo.name for photo in photos if mask_file(photo) is None], len(photos), known[0], "masks")
     return with_unique_names(taken)
 
 
-def check_pictures(images: ImagesLike) -> None:
+def check_pictures(paths: Sequence[str]) -> None:
     """Checks that files and folders hold pictures, without decoding any, before weights are downloaded.
 
     Raises:
@@ -108,11 +110,8 @@ def check_pictures(images: ImagesLike) -> None:
         ImportError: if a video needs a package that is not installed.
         ValueError: if there is no picture, or a file is not a picture.
     """
-    for item in as_items(images):
-        path = existing_path(item) if isinstance(item, (str, Path)) else None
-        if path is None:
-            continue
-        if _is_video(path):
+    for path in map(existing_path, paths):
+        if path.suffix.lower() in VIDEO_SUFFIXES:
             require_pyav(f"reading {path}")
         elif path.is_file():
             _pictures(path, 1)
@@ -132,7 +131,8 @@ def check_limit(max_images: int | None) -> None:
 
 
 def evenly(pictures: list[Picture], limit: int | None) -> list[Picture]:
-    """Returns at most ``limit`` of the pictures, evenly spread; None: all."""
+    """Returns at most ``limit`` of the pictures, evenly spread; None: all. Raises ValueError if it is below 1."""
+    check_limit(limit)
     return pictures if limit is None or len(pictures) <= limit else [pictures[i] for i in spread(len(pictures), limit)]
 
 
@@ -168,15 +168,6 @@ def mask_file(path: Path) -> Path | None:
     return next((file for file in files if file is not None), None)
 
 
-def _check_masks(photos: Sequence[Path]) -> None:
-    """Warns about photographs without a mask next to a folder of masks."""
-    folders = {place / MASKS for photo in photos for place in (photo.parent, photo.parent.parent)}
-    known = sorted(folder for folder in folders if folder.is_dir())
-    if known:
-        lacking = [photo.name for photo in photos if mask_file(photo) is None]
-        warn_without_mask(lacking, len(photos), known[0], "masks")
-
-
 def mask_for(path: Path, upright: bool = True, content: bytes | None = None) -> NDArray[np.float32] | None:
     """Returns the pixel weights of a photograph: the product of its alpha and its mask file (:func:`mask_file`)."""
     parts = [read_mask(path, "", content=content, upright=upright)]
@@ -197,13 +188,11 @@ def _pictures(item: Any, max_images: int | None) -> list[Picture]:
         if not files:
             raise ValueError(f"{path} holds no images (rgbd/0.jpg and so on): is it a recording of Record3D?")
         return [_photo(file, read_recorded) for file in files.values()]
-    return _video(path, max_images or VIDEO_FRAMES) if _is_video(path) else [_photo(path)]
+    return _video(path, max_images or VIDEO_FRAMES) if path.suffix.lower() in VIDEO_SUFFIXES else [_photo(path)]
 
 
 def image_files(folder: Path) -> list[Path]:
     """Lists the images of a folder, or of its image subfolder if that has more, sorted by the numbers in their names.
-
-    Ignored images are named in a warning.
 
     Raises:
         ValueError: if there are none.
@@ -212,30 +201,19 @@ def image_files(folder: Path) -> list[Path]:
     found = {place: [file for file in place.iterdir() if _is_image(file) and file.is_file()] for place in places}
     taken = max(places, key=lambda place: len(found[place]))  # the first of equals
     if not found[taken]:
-        videos = sorted(file.name for file in folder.iterdir() if file.suffix.lower() in VIDEO_SUFFIXES)
-        hint = f"; it contains videos, pass one of them: {folder / videos[0]}" if videos else ""
         suffixes = ", ".join((*IMAGE_SUFFIXES, *HEIC_SUFFIXES))
-        raise ValueError(f"no images in {folder} (looked for {suffixes}, there and in images/){hint}")
-    if taken == folder:
-        others = [path for path in folder.iterdir() if path.is_dir() and path.name.lower() not in _NO_PHOTOGRAPHS]
-        passed = [f"{path.name}/" for path in others if any(_is_image(file) for file in path.iterdir())]
-    else:
-        passed = [file.name for file in found[folder]]
-    if passed:
-        log.warning("images are taken from %s; ignored in the same folder: %s", taken, ", ".join(sorted(passed)[:10]))
+        raise ValueError(f"no images in {folder} (looked for {suffixes}, there and in images/)")
+    if taken != folder and found[folder]:
+        log.warning("images are taken from %s; %d next to it are ignored", taken, len(found[folder]))
     return sorted(found[taken], key=lambda file: by_number(file.name))
 
 
 def image_folders(folder: Path) -> list[Path]:
     """Lists the image subfolders of a folder, ignoring case; reduced ones (``images_4``) come last."""
-    found = [path for path in folder.iterdir() if path.is_dir() and is_image_folder(path.name)]
+    named = re.compile(rf"{'|'.join(IMAGE_FOLDERS)}|images_\d+", re.IGNORECASE)
+    found = [path for path in folder.iterdir() if path.is_dir() and named.fullmatch(path.name)]
     order = {name: number for number, name in enumerate(IMAGE_FOLDERS)}
     return sorted(found, key=lambda path: (order.get(path.name.lower(), len(order)), by_number(path.name)))
-
-
-def is_image_folder(name: str) -> bool:
-    """Returns whether a folder of this name usually holds a scene's images."""
-    return name.lower() in IMAGE_FOLDERS or re.fullmatch(r"images_\d+", name.lower()) is not None
 
 
 def _is_image(path: Path) -> bool:
@@ -245,7 +223,11 @@ def _is_image(path: Path) -> bool:
 def _photo(path: Path, content_of: Callable[[Path], bytes | None] = lambda _: None) -> Picture:
     """Returns a photograph; ``content_of`` reads files inside an archive."""
     if path.suffix.lower() in HEIC_SUFFIXES:
-        _open_heic(path)
+        if importlib.util.find_spec("pillow_heif") is None:
+            raise ValueError(f"{path} is HEIC and requires pillow-heif: pip install pillow-heif, or save it as JPEG")
+        from pillow_heif import register_heif_opener  # pyright: ignore[reportMissingImports]
+
+        register_heif_opener()
 
     def read(size: tuple[int, int]) -> Frames:
         content = content_of(path)
@@ -258,23 +240,9 @@ def _photo(path: Path, content_of: Callable[[Path], bytes | None] = lambda _: No
         return Picture(path.stem, size, read)
     if is_panorama(path, size):
         raise ValueError(
-            f"{path} is a 360 degree panorama (equirectangular), which a pinhole camera cannot represent: convert it "
-            "to cube faces and use these"
+            f"{path} is a 360 degree panorama, which no pinhole camera represents: convert it to cube faces"
         )
     return Picture(path.stem, size, read, focal=focal_length(path, size), path=path)
-
-
-def _open_heic(path: Path) -> None:
-    """Registers pillow-heif, with which Pillow reads HEIC files."""
-    if importlib.util.find_spec("pillow_heif") is None:
-        raise ValueError(f"{path} is HEIC and requires pillow-heif: pip install pillow-heif, or save photos as JPEG")
-    from pillow_heif import register_heif_opener  # pyright: ignore[reportMissingImports]
-
-    register_heif_opener()
-
-
-def _is_video(item: Any) -> bool:
-    return isinstance(item, (str, Path)) and Path(item).suffix.lower() in VIDEO_SUFFIXES
 
 
 def _video(path: Path, limit: int) -> list[Picture]:
@@ -319,7 +287,7 @@ def _from_memory(item: Any) -> list[Picture]:
     return [_in_memory("image", image) for image in (pixels[None] if pixels.ndim == 3 else pixels)]
 
 
-def spread(count: int, limit: int) -> Iterable[int]:
+def spread(count: int, limit: int) -> list[int]:
     """Returns ``limit`` of ``count`` positions, evenly spread, including the first and the last."""
     return [round(i * (count - 1) / max(limit - 1, 1)) for i in range(limit)]
 
@@ -327,34 +295,24 @@ def spread(count: int, limit: int) -> Iterable[int]:
 def with_unique_names(pictures: Sequence[Picture]) -> list[Picture]:
     """Returns the pictures with a number appended to names that occur more than once."""
     counts = Counter(picture.name for picture in pictures)
-    taken, result = {name for name, count in counts.items() if count == 1}, []
-    number: Counter[str] = Counter()
-    for picture in pictures:
-        name = picture.name
-        while counts[picture.name] > 1 and (name == picture.name or name in taken):
-            name = f"{picture.name}-{number[picture.name]:03d}"
-            number[picture.name] += 1
-        taken.add(name)
-        result.append(replace(picture, name=name))
-    return result
+    numbers = {name: itertools.count() for name, count in counts.items() if count > 1}
+    return [
+        replace(each, name=f"{each.name}-{next(numbers[each.name]):03d}") if each.name in numbers else each
+        for each in pictures
+    ]
 
 
-def without_copies(pictures: Sequence[Picture], decode: bool = False) -> list[Picture]:
-    """Returns the pictures without byte-identical copies of earlier files, which are named in a warning.
-
-    Args:
-        pictures: in order.
-        decode: also compare the pixels of pictures without a file of their own; otherwise these are all kept.
-    """
+def without_copies(pictures: Sequence[Picture]) -> list[Picture]:
+    """Returns the pictures without byte-identical copies of earlier image files, which are named in a warning."""
     first: dict[str, str] = {}
     found, copies = [], []
     for picture in pictures:
-        whole = picture.path is not None and picture.path.suffix.lower() in (*IMAGE_SUFFIXES, *HEIC_SUFFIXES)
-        key = digest(picture) if whole or (decode and picture.path is None) else ""
-        if key and key in first:
+        key = digest(picture) if picture.path is not None and _is_image(picture.path) else None
+        if key in first:
             copies.append(f"{picture.name} (as {first[key]})")
-        else:
-            found.append(picture)
+            continue
+        found.append(picture)
+        if key is not None:
             first[key] = picture.name
     if copies:
         log.warning("%d images are copies of others and are left out: %s", len(copies), ", ".join(copies[:10]))

@@ -3,32 +3,34 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from vg2gt.geometry.precision import half_precision_on_gpu
+from vg2gt.io.files import by_number
 from vg2gt.memory import RECONSTRUCTION, memory_advice, note_sizes
 from vg2gt.method.additions.far_shell import far_shell
 from vg2gt.model import VG2GT, Reconstructor
 from vg2gt.reconstruction.cameras import Poses, pictures_for
-from vg2gt.reconstruction.frame import first_frame, moved_gaussians, similarity_of
-from vg2gt.reconstruction.inputs import Views, as_given, in_order, load_views, source_of, working_order, working_size
+from vg2gt.reconstruction.frame import first_frame, similarity_of
+from vg2gt.reconstruction.inputs import as_given, in_order, load_views, source_of, working_order, working_size
 from vg2gt.reconstruction.monitor import Monitor
 from vg2gt.reconstruction.output_names import WINDOWS
 from vg2gt.reconstruction.pictures import SFM_SOURCE, ImagesLike, spread
 from vg2gt.reconstruction.saved import read_scene
 from vg2gt.reconstruction.scene import Scene
 from vg2gt.reconstruction.trust import pixel_trust
-from vg2gt.reconstruction.windows.capture import AUTOMATIC, window_size
 from vg2gt.reconstruction.windows.run import WindowRun, device_of, gaussians_of, set_key, window_model
-from vg2gt.reconstruction.windows.store import Anchor, finished_sets, joined, key_of, read_anchor, without
+from vg2gt.reconstruction.windows.store import AUTOMATIC, Anchor, finished_sets, key_of, read_anchor, window_size
 from vg2gt.rendering import Renderer
 from vg2gt.runs.load import load_model
-from vg2gt.types import Gaussians, Geometry
+from vg2gt.types import Cameras
 from vg2gt.uncertainty import Calibration
 
 
@@ -96,30 +98,24 @@ def reconstruct_with(
     """
     monitor = monitor or Monitor()
     device = device_of(model)
-    chosen = pictures_for(
-        model,
-        images,
-        poses,
-        max_images=max_images,
-        sfm_folder=None if sfm_folder is None else Path(sfm_folder),
-        monitor=monitor,
-    )
+    chosen = pictures_for(model, images, poses, max_images=max_images, sfm_folder=sfm_folder, monitor=monitor)
     with memory_advice(RECONSTRUCTION), chosen as pictures:
         sizes = [picture.size for picture in pictures]
         target = anchor.size if anchor else working_size(sizes, model.backend.patch_size, device.type, size)
         note_sizes({f"images of {target[0]}x{target[1]}": len(pictures)})
-        size_of_windows, to_source = window_size(window, len(pictures), keep_windows or anchor is not None), None
-        error, support = None, None
+        size_of_windows = window_size(window, len(pictures), keep_windows or anchor is not None)
+        to_source, error, support = None, None, None
         if size_of_windows:
             # memory-mapped files stay readable after their removal
             with TemporaryDirectory(prefix="vg2gt-windows-", ignore_cleanup_errors=True) as temporary:
                 place = Path(window_folder or temporary)
                 run = WindowRun(window_model(model.eval()), pictures, target, size_of_windows, place, monitor, anchor)
                 geometry, gaussians, unit = run.geometry_and_gaussians()
-                views = run.views()
+                images, mask = run.capture.images, run.capture.mask
                 to_source = run.anchor.to_source if run.anchor and source_of(pictures) else None
         else:
             views = load_views(pictures, target, monitor)
+            images, mask = views.images, views.mask
             order = working_order(views.images)
             ordered, hints = in_order(views, order)
             ordered, hints = ordered[None].to(device), hints.to(device)
@@ -127,57 +123,43 @@ def reconstruct_with(
                 prediction = model.eval()(ordered, hints)
             geometry, gaussians = as_given(prediction.surface.detach(), order), prediction.gaussians
             unit = prediction.unit
-            error, support = pixel_trust(prediction, order, views.mask, calibration)
-    scene = _scene(geometry, gaussians, float(unit), views, renderer or Renderer(), model.backend.is_metric)
-    scene = replace(scene, error=error, support=support)
-    if to_source is not None and scene.frame is not None:  # exactly the same for all image sets
-        scene = replace(scene, frame=replace(scene.frame, to_source=to_source))
+            error, support = pixel_trust(prediction, order, mask, calibration)
+    if not len(gaussians):
+        raise ValueError("the backend found no depth in any image, so there is nothing to reconstruct")
+    source = pictures[0].source
+    known = [picture.pose for picture in pictures if picture.pose is not None]
+    given = np.stack(known) if source and len(known) == len(pictures) else None
+    target = "given" if source and not source.startswith(SFM_SOURCE) else "upright"
+    frame = first_frame(geometry.cameras, float(unit), given, target)
+    metres = frame.scale if pictures[0].is_metric else None
+    scene = Scene(
+        gaussians=gaussians.detach(),
+        cameras=geometry.cameras,
+        images=images,
+        depth=geometry.depth[0].cpu(),
+        depth_conf=geometry.depth_conf[0].cpu(),
+        names=tuple(picture.name for picture in pictures),
+        renderer=renderer or Renderer(),
+        metres_per_unit=float(geometry.scale) if model.backend.is_metric else metres,
+        cameras_from=source,
+        frame=frame if to_source is None else replace(frame, to_source=to_source),  # the same for all image sets
+        mask=mask,
+        pictures=tuple(pictures),
+        error=error,
+        support=support,
+    )
     scene = scene if model.visibility is None or anchor else with_far_shell(scene)
     return scene.placed()
 
 
 def with_far_shell(scene: Scene) -> Scene:
     """Returns the scene with a far shell for pixels that no view can place."""
-    some = torch.arange(len(scene.names))
-    if len(some) > AUTOMATIC:
-        some = torch.tensor(list(spread(len(some), AUTOMATIC)))
+    some = torch.tensor(spread(len(scene.names), min(len(scene.names), AUTOMATIC)))
     mask = None if scene.mask is None else scene.mask[some]
     shell = far_shell(scene.images[some], scene.depth[some], scene.cameras.to("cpu").select(some), mask)
     if shell is None:
         return scene
     return replace(scene, gaussians=scene.gaussians.joined(shell.to(scene.gaussians.means.device)))
-
-
-def _scene(
-    geometry: Geometry,
-    gaussians: Gaussians,
-    unit: float,
-    views: Views,
-    renderer: Renderer,
-    is_metric: bool,
-) -> Scene:
-    source = views.pictures[0].source
-    known = [picture.pose for picture in views.pictures if picture.pose is not None]
-    poses = np.stack(known) if source and len(known) == len(views.names) else None
-    target = "given" if source and not source.startswith(SFM_SOURCE) else "upright"
-    frame = first_frame(geometry.cameras, unit, poses, target)
-    metres = float(geometry.scale) if is_metric else frame.scale if views.pictures[0].is_metric else None
-    if not len(gaussians):
-        raise ValueError("the backend found no depth in any image, so there is nothing to reconstruct")
-    return Scene(
-        gaussians=gaussians.detach(),
-        cameras=geometry.cameras,
-        images=views.images,
-        depth=geometry.depth[0].cpu(),
-        depth_conf=geometry.depth_conf[0].cpu(),
-        names=views.names,
-        renderer=renderer,
-        metres_per_unit=metres,
-        cameras_from=source,
-        frame=frame,
-        mask=views.mask,
-        pictures=views.pictures,
-    )
 
 
 def add_images(
@@ -215,7 +197,7 @@ def add_images(
         window_folder=folder / WINDOWS,
         anchor=anchor,
     )
-    scene = joined(old, new)
+    scene = _joined(old, new)
     return scene if model.visibility is None else with_far_shell(scene)
 
 
@@ -235,9 +217,12 @@ def take_out(
         place = kept / set_key(model, pictures, anchor.size, size, anchor)[:12]
     if place not in finished_sets(kept):
         raise ValueError("these images were not added by one command: give the same folder and the same --window")
-    scene = without(old, names)
+    left = [view for view, name in enumerate(old.names) if name not in names]
+    if not left:
+        raise ValueError("no image would be left in the scene")
     gaussians = gaussians_of(model, kept, anchor, monitor, left_out=place)
-    scene = replace(scene, gaussians=moved_gaussians(gaussians, similarity_of(anchor.to_source)))
+    moved = similarity_of(anchor.to_source).apply_gaussians(gaussians)
+    scene = replace(_with_views(old, left), gaussians=moved)
     shutil.rmtree(place)
     return scene if model.visibility is None else with_far_shell(scene)
 
@@ -247,3 +232,36 @@ def _anchor(model: VG2GT, folder: Path) -> Anchor:
     if anchor.model != key_of(window_model(model)):
         raise ValueError(f"{folder} was made with another model: take the same backend, checkpoint and options")
     return anchor
+
+
+def _joined(old: Scene, new: Scene) -> Scene:
+    """Joins the views of two scenes in one frame, sorted by name, with the Gaussians of the second."""
+
+    def both(one: Tensor, other: Tensor) -> Tensor:
+        return torch.cat((one.to(other.device), other))
+
+    masks = [torch.ones_like(each.depth) if each.mask is None else each.mask for each in (old, new)]
+    poses = both(old.cameras.world_to_camera[0], new.cameras.world_to_camera[0])[None]
+    intrinsics = both(old.cameras.intrinsics[0], new.cameras.intrinsics[0])[None]
+    scene = replace(
+        new,
+        cameras=Cameras(poses, intrinsics, new.cameras.size),
+        mask=None if old.mask is None and new.mask is None else both(*masks),
+        names=(*old.names, *new.names),
+        poses=None if old.poses is None or new.poses is None else both(old.poses, new.poses),
+        **{name: both(getattr(old, name), getattr(new, name)) for name in ("images", "depth", "depth_conf")},
+    )
+    return _with_views(scene, sorted(range(len(scene.names)), key=lambda view: by_number(scene.names[view])))
+
+
+def _with_views(scene: Scene, views: Sequence[int]) -> Scene:
+    """Returns the scene with some of its views; its Gaussians stay."""
+    rows = torch.tensor(views)
+    maps = {name: getattr(scene, name) for name in ("images", "depth", "depth_conf", "mask", "poses")}
+    return replace(
+        scene,
+        cameras=scene.cameras.select(rows.to(scene.cameras.world_to_camera.device)),
+        names=tuple(scene.names[view] for view in views),
+        pictures=(),
+        **{name: None if values is None else values[rows] for name, values in maps.items()},
+    )

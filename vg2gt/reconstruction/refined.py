@@ -7,18 +7,12 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-import torch
-from torch import Tensor
-
-from vg2gt.io.images import colorize_normals, grid
 from vg2gt.reconstruction.monitor import Monitor
-from vg2gt.reconstruction.pictures import spread
-from vg2gt.refinement import Observations, RefinedScene, RefineOptions, refine
+from vg2gt.refinement import Observations, RefineOptions, refine
 
 if TYPE_CHECKING:
     from vg2gt.reconstruction.scene import Scene
 
-ROWS = 4
 RECORDINGS = ("RGBDFolder", "TUM")  # their measured poses fit their depth better than bundle adjustment does
 
 
@@ -65,14 +59,12 @@ def refinement_figures(scene: Scene) -> dict[str, Any]:
         "best_step": refined.step,
         "seconds": round(refined.seconds, 2),
         "ended": refined.ended,
-        "retreats": refined.retreats,
-        "gaussians_before": len(refined.start.gaussians),
-        "gaussians_after": len(refined.scene.gaussians),
     }
-    for name, views in (("trained", refined.trained), ("held_out", refined.held_out)):
-        if len(views):
-            before, after = (round(float(psnr), 3) for psnr in refined.psnr[:, views].mean(1))
-            figures |= {f"psnr_{name}_before": before, f"psnr_{name}_after": after}
+    for when, state, psnr in zip(("before", "after"), (refined.start, refined.scene), refined.psnr, strict=True):
+        figures[f"gaussians_{when}"] = len(state.gaussians)
+        for name, views in (("trained", refined.trained), ("held_out", refined.held_out)):
+            if len(views):
+                figures[f"psnr_{name}_{when}"] = round(float(psnr[views].mean()), 3)
     return {"refinement": figures}
 
 
@@ -89,26 +81,3 @@ def refinement_lines(scene: Scene) -> list[str]:
     ended = {"interrupted": ", interrupted", "diverged": ", stopped because it diverged"}.get(refined.ended, "")
     lines.append(f"best state: step {refined.step} of {refined.steps}{ended}; Gaussians: {before} -> {after}")
     return lines
-
-
-@torch.no_grad()
-def before_and_after(scene: Scene) -> Tensor:
-    """Renders an image ``[3, H', W']`` of up to 4 views, held-out ones first.
-
-    Columns: image, rendered colour before and after, normals before and after.
-    """
-    refined = scene.refined
-    assert refined is not None
-    trained = refined.trained[torch.tensor(sorted(spread(len(refined.trained), min(ROWS, len(refined.trained)))))]
-    views = torch.cat((refined.held_out, trained))[:ROWS]
-
-    def panels(state: RefinedScene, view: Tensor) -> tuple[Tensor, Tensor]:
-        view = view.to(state.gaussians.means.device)
-        shown = scene.renderer(state.gaussians, state.cameras.select(view)).to("cpu")
-        return shown.color[0, 0].clamp(0, 1), colorize_normals(shown.normal[0, 0])
-
-    rows = []
-    for view in views.split(1):
-        before, after = (panels(state, view) for state in (refined.start, refined.scene))
-        rows.append([scene.images[int(view)], before[0], after[0], before[1], after[1]])
-    return grid(rows)

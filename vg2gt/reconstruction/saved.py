@@ -47,13 +47,9 @@ def read_scene(folder: str | Path, renderer: Renderer, device: torch.device | st
     named = read_cameras_json(folder / "cameras.json")
     sizes = sorted({(camera.height, camera.width) for camera in named})
     if len(sizes) != 1:
-        raise ValueError(
-            f"{folder / 'cameras.json'} has cameras of {len(sizes)} sizes {sizes[:3]}; one size is expected"
-        )
-    poses, intrinsics = (
-        torch.from_numpy(np.stack([getattr(camera, name) for camera in named]))
-        for name in ("world_to_camera", "intrinsics")
-    )
+        raise ValueError(f"{folder / 'cameras.json'} has cameras of {len(sizes)} sizes {sizes[:3]}; one is expected")
+    poses = torch.from_numpy(np.stack([camera.world_to_camera for camera in named]))
+    intrinsics = torch.from_numpy(np.stack([camera.intrinsics for camera in named]))
     frame, similarity = str(report.get("frame", "given")), named[0].similarity
     cameras_from, metres = str(report.get("cameras", PREDICTED)), named[0].metres_per_unit
     return Scene(
@@ -78,16 +74,13 @@ def _read_views(path: Path, named: list[NamedCamera], size: tuple[int, int]) -> 
             raise FormatError("it is of other images than cameras.json next to it")
         shape = (len(named), *size)
         wrong = [f"{name} {a.shape}" for name, a in arrays.items() if a.shape != shape + (3,) * (name == "images")]
-        if wrong or arrays["images"].dtype != np.uint8:
-            raise FormatError(
-                f"it does not belong to the {len(named)} cameras of {size[0]}x{size[1]} next to it: "
-                f"{', '.join(wrong) or 'its images are not uint8'}"
-            )
+        if wrong:
+            cameras = f"{len(named)} cameras of {size[0]}x{size[1]}"
+            raise FormatError(f"it does not belong to the {cameras} next to it: {', '.join(wrong)}")
     except (KeyError, FormatError) as error:
         raise FormatError(f"{path}: {error}; write it again with vg2gt reconstruct --save views.npz") from error
     found = {name: torch.from_numpy(array) for name, array in arrays.items()}
-    images = found.pop("images").permute(0, 3, 1, 2).float() / 255
-    numbers = {name: found.pop(name).float() for name in ("depth", "depth_conf", "mask") if name in found}
+    found["images"] = found["images"].permute(0, 3, 1, 2).float() / 255
     for name in ("depth", "depth_conf"):
-        numbers[name] = numbers[name].nan_to_num(0.0, 0.0, 0.0).clamp(min=0)
-    return {"images": images, **numbers, **found}
+        found[name] = found[name].float().nan_to_num(0.0, 0.0, 0.0).clamp(min=0)
+    return found

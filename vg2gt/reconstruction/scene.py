@@ -15,7 +15,7 @@ from torch import Tensor
 
 from vg2gt.geometry.cameras import unproject
 from vg2gt.io.cameras_json import NamedCamera, named_cameras
-from vg2gt.reconstruction.frame import SceneFrame, move_to_target, moved_cameras, moved_gaussians
+from vg2gt.reconstruction.frame import SceneFrame, move_to_target, moved_cameras
 from vg2gt.reconstruction.inputs import photo_of
 from vg2gt.reconstruction.pictures import Picture
 from vg2gt.refinement import Refined, RefineOptions
@@ -47,27 +47,25 @@ class RenderedView:
 
 @dataclass(frozen=True)
 class ScenePoints:
-    """Coloured points of a scene, each with the pixel it comes from.
+    """Coloured points of a scene, each with the view it comes from.
 
     Attributes:
         positions: ``[N, 3]`` float64 in the world frame.
         colors: ``[N, 3]`` uint8.
         views: ``[N]`` index of the view.
-        pixels: ``[N, 2]`` (x, y), integer pixel centres.
     """
 
     positions: NDArray[np.float64]
     colors: NDArray[np.uint8]
     views: NDArray[np.int64]
-    pixels: NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class Scene:
     """The result of :func:`vg2gt.reconstruct`.
 
-    The world frame and unit are those of ``frame``: by default those of the given cameras, or else the reference camera
-    (:mod:`vg2gt.reconstruction.order`) turned upright (x right, y down, z forward), with a median depth of about 1.
+    The world frame and unit are those of the given cameras, or else the reference camera turned upright (x right, y
+    down, z forward), with a median depth of about 1.
 
     Attributes:
         gaussians: Gaussians of the scene, on the device where it was made.
@@ -123,17 +121,13 @@ class Scene:
         """Returns the views' cameras, named like the image files that :meth:`save` writes."""
         named = named_cameras(self.cameras, [f"{name}.png" for name in self.names])
         if self.poses is not None and torch.equal(self.poses.float(), self.cameras.world_to_camera[0].cpu().float()):
-            named = [
-                replace(camera, world_to_camera=pose.numpy()) for camera, pose in zip(named, self.poses, strict=True)
-            ]
+            named = [replace(c, world_to_camera=pose.numpy()) for c, pose in zip(named, self.poses, strict=True)]
         if self.frame is None:
             return named
-        found = [
-            replace(camera, similarity=self.frame.to_source, metres_per_unit=self.metres_per_unit) for camera in named
-        ]
-        if len(self.pictures) != len(found):
-            return found
-        return [replace(c, photo=photo_of(c, picture)) for c, picture in zip(found, self.pictures, strict=True)]
+        named = [replace(c, similarity=self.frame.to_source, metres_per_unit=self.metres_per_unit) for c in named]
+        if not self.pictures:
+            return named
+        return [replace(c, photo=photo_of(c, picture)) for c, picture in zip(named, self.pictures, strict=True)]
 
     def placed(self) -> Scene:
         """Returns the scene in its target frame and unit (``frame.target``)."""
@@ -145,7 +139,7 @@ class Scene:
         scale = float(move.scale)
         return replace(
             self,
-            gaussians=moved_gaussians(self.gaussians, move),
+            gaussians=move.apply_gaussians(self.gaussians),
             cameras=cameras,
             depth=self.depth * scale,
             metres_per_unit=None if self.metres_per_unit is None else self.metres_per_unit / scale,
@@ -158,18 +152,14 @@ class Scene:
         """Renders views one by one, to bound memory; None: the input views."""
         return render_views(self.renderer, self.gaussians, self.named_cameras() if cameras is None else cameras)
 
-    def points(self, limit: int = POINTS) -> ScenePoints:
-        """Returns points of the decoded depth on a regular grid of pixels, at most about ``limit``."""
-        views, height, width = self.depth.shape
-        step = max(1, int(np.ceil(np.sqrt(views * height * width / limit))))
+    def points(self) -> ScenePoints:
+        """Returns points of the decoded depth on a regular grid of pixels, about 100,000 or fewer."""
+        step = max(1, int(np.ceil(np.sqrt(self.depth.numel() / POINTS))))
         grid = (slice(None), slice(step // 2, None, step), slice(step // 2, None, step))
         world = unproject(self.depth[None].double(), self.cameras.to("cpu").map(Tensor.double))[0]
         keep = self.depth[grid] > 0
-        indices = torch.meshgrid(*(torch.arange(side) for side in self.depth.shape), indexing="ij")
-        view, row, column = (index[grid][keep] for index in indices)
         colors = (self.images.permute(0, 2, 3, 1)[grid][keep] * 255 + 0.5).to(torch.uint8)
-        pixels = torch.stack((column, row), -1)
-        return ScenePoints(world[grid][keep].numpy(), colors.numpy(), view.numpy(), pixels.numpy())
+        return ScenePoints(world[grid][keep].numpy(), colors.numpy(), keep.nonzero()[:, 0].numpy())
 
     def refine(self, options: RefineOptions | None = None, **changes: Any) -> Scene:
         """Optimises Gaussians and cameras on the scene's own images (:func:`vg2gt.refinement.refine`).

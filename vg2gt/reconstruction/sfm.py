@@ -1,7 +1,8 @@
 """Camera estimation by structure from motion: COLMAP's incremental mapper from pycolmap (``vg2gt[colmap]``).
 
-All pairs of up to 60 photographs are matched. With more, only likely pairs are
-(:mod:`vg2gt.reconstruction.sfm_pairs`), with fewer features per image.
+All pairs of up to 60 photographs are matched. With more, each is matched with some earlier ones in the given order, at
+doubling distances (neighbours on a walk have little baseline), and with those that look alike by VLAD vectors (Jegou et
+al. 2010) of SIFT features. Their vocabulary is built from the photographs, so that none has to be downloaded.
 
 The result is kept in a folder that every command reads as a COLMAP recording: undistorted ``images/``, ``masks/`` if
 there are masks, a model of PINHOLE cameras in ``sparse/``, and ``sfm.json``, which identifies the input pictures.
@@ -18,6 +19,7 @@ import logging
 import shutil
 import tempfile
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,6 +28,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image
+from scipy.cluster.vq import kmeans2, vq
 
 from vg2gt.data.sources.colmap_model import COLMAP, model_folder_of
 from vg2gt.data.transforms import reduce_to_fit, to_bytes
@@ -34,8 +37,7 @@ from vg2gt.io.errors import FormatError
 from vg2gt.io.files import read_json, whole_folder, write_json
 from vg2gt.reconstruction.given_cameras import LAYOUTS, recording_pictures
 from vg2gt.reconstruction.monitor import Monitor
-from vg2gt.reconstruction.pictures import SFM_SOURCE, UNKNOWN_LENS, Picture, digest, mask_file, without_copies
-from vg2gt.reconstruction.sfm_pairs import ALL_PAIRS, likely_pairs
+from vg2gt.reconstruction.pictures import SFM_SOURCE, UNKNOWN_LENS, Picture, digest, mask_file
 
 if TYPE_CHECKING:
     from pycolmap import Reconstruction  # pyright: ignore[reportMissingImports]
@@ -47,6 +49,11 @@ FORMAT = 1
 IMAGE_SIDE = 1600  # maximum longer side of the kept images, in pixels
 FEATURE_SIDE, FEATURES = 1280, 4096  # longer side of the images for feature extraction, maximum number of features
 MANY_SIDE, MANY_FEATURES = 1024, 2048  # the same for more than ALL_PAIRS photographs
+ALL_PAIRS = 60  # number of photographs up to which all pairs are matched
+DISTANCES = (1, 2, 4, 8, 16)  # to the paired photographs in the given order
+ALIKE = 10  # similar photographs per photograph
+APART = 3  # they are more than this far apart in the order: frames of a video would all be neighbours
+WORDS, ROUNDS, SAMPLE = 64, 10, 20_000  # clusters, iterations and sampled features of k-means
 SEED = 0
 _MODEL = "SIMPLE_RADIAL"
 _QUALITY = 95  # JPEG quality of the kept images
@@ -56,10 +63,10 @@ _PAIRS_AT_ONCE = 256  # pairs per call of the matcher, which indexes the feature
 _STATE = "sfm.json"
 _MASKS = "masks"
 
+_OTHERWISE = f"or put camera files next to them ({LAYOUTS}), or use a backend that needs no cameras, such as da3_small"
 ADVICE = (
     "take more photographs, 20 or more, walking around the scene rather than turning on the spot, each overlapping "
-    f"the previous one by two thirds; or put camera files next to them ({LAYOUTS}); or use a backend that needs no "
-    "cameras, such as da3_small"
+    f"the previous one by two thirds; {_OTHERWISE}"
 )
 
 
@@ -70,10 +77,7 @@ def require_pycolmap() -> None:
         ImportError: if it is not; the message names the remedies.
     """
     if importlib.util.find_spec("pycolmap") is None:
-        raise ImportError(
-            f"finding the cameras of photographs needs pycolmap: {EXTRA}; or put camera files next to them "
-            f"({LAYOUTS}), or use a backend that needs no cameras, such as da3_small"
-        )
+        raise ImportError(f"finding the cameras of photographs needs pycolmap: {EXTRA}; {_OTHERWISE}")
 
 
 def find_cameras(pictures: Sequence[Picture], folder: Path, monitor: Monitor) -> list[Picture]:
@@ -95,17 +99,15 @@ def find_cameras(pictures: Sequence[Picture], folder: Path, monitor: Monitor) ->
         FileExistsError: if the folder contains other files.
         ValueError: if no model of the scene is found; the message says what to try.
     """
-    pictures = without_copies(pictures, decode=True)
     key = _key(pictures)
-    state = _read_state(folder)
-    if state is None or state["key"] != key:
+    state = _read_state(folder, key)
+    if state is None:
         require_pycolmap()
-        _check_ours(folder)
+        if folder.exists() and any(folder.iterdir()) and not (folder / _STATE).is_file():
+            raise FileExistsError(f"{folder} already exists and contains other files; move it or choose another --out")
         if len(pictures) < 2:
             raise ValueError(f"a single image is not enough to estimate depth or cameras: {ADVICE}")
         state = _solve(pictures, folder, key, monitor)
-    else:
-        log.info("cameras of the same images are reused from %s", folder)
     if state["left_out"]:
         log.warning(
             "%d of %d images overlap too little with the others; they have no cameras and are left out: %s",
@@ -127,33 +129,22 @@ def find_cameras(pictures: Sequence[Picture], folder: Path, monitor: Monitor) ->
 def _key(pictures: Sequence[Picture]) -> str:
     """Returns a hash of the pictures' contents, masks, names and order, and of the processing settings."""
     settings = [FORMAT, IMAGE_SIDE, *_feature_settings(len(pictures)), SEED, _MODEL, _QUALITY]
-    masks = [None if picture.path is None else mask_file(picture.path) for picture in pictures]
-    hashes = [None if mask is None else hashlib.sha256(mask.read_bytes()).hexdigest() for mask in masks]
-    contents = [
-        [picture.name, picture.size, digest(picture), *([mask] if mask else [])]
-        for picture, mask in zip(pictures, hashes, strict=True)
-    ]
+    contents = []
+    for picture in pictures:
+        mask = None if picture.path is None else mask_file(picture.path)
+        hashed = [] if mask is None else [hashlib.sha256(mask.read_bytes()).hexdigest()]
+        contents.append([picture.name, picture.size, digest(picture), *hashed])
     return hashlib.sha256(json.dumps([settings, contents]).encode()).hexdigest()
 
 
-def _read_state(folder: Path) -> dict[str, Any] | None:
-    """Reads the state of a result folder; None if it is missing, incomplete or damaged."""
+def _read_state(folder: Path, key: str) -> dict[str, Any] | None:
+    """Reads the state of a result folder; None if it is missing, damaged, incomplete, or of other pictures."""
     try:
         state = read_json(folder / _STATE)
-    except (FormatError, OSError):
+        same = state["key"] == key and all((folder / "images" / name).is_file() for name in state["images"])
+    except (FormatError, OSError, KeyError, TypeError):
         return None
-    kinds = {"key": str, "images": dict, "left_out": list, "points": int}
-    known = isinstance(state, dict) and all(isinstance(state.get(name), kind) for name, kind in kinds.items())
-    known = known and state["points"] >= FEWEST_POINTS  # earlier versions kept models without any
-    whole = known and all((folder / "images" / name).is_file() for name in state["images"])
-    return state if whole and model_folder_of(folder) is not None else None
-
-
-def _check_ours(folder: Path) -> None:
-    """Refuses to replace a folder that holds anything but an earlier result."""
-    empty = not folder.exists() or (folder.is_dir() and not any(folder.iterdir()))
-    if not empty and not (folder / _STATE).is_file():
-        raise FileExistsError(f"{folder} already exists and contains other files; move it or choose another --out")
+    return state if same and model_folder_of(folder) is not None else None
 
 
 def _solve(pictures: Sequence[Picture], folder: Path, key: str, monitor: Monitor) -> dict[str, Any]:
@@ -178,7 +169,6 @@ def _solve(pictures: Sequence[Picture], folder: Path, key: str, monitor: Monitor
             "images": {name: title for name, title in titles.items() if name in placed},
             "left_out": [title for name, title in titles.items() if name not in placed],
             "other_parts": [[titles[name] for name in sorted(part)] for part in others if part],
-            "points": models[0].num_points3D(),
         }
         with whole_folder(folder) as staged:
             for part in ("images", "sparse"):
@@ -268,7 +258,7 @@ def _match(work: Path, names: Sequence[str], monitor: Monitor) -> None:
     database = work / "database.db"
     chosen = [(before, later) for later in range(len(names)) for before in range(later)]
     if len(names) > ALL_PAIRS:
-        chosen = likely_pairs(_descriptors(database, names), SEED)
+        chosen = likely_pairs(_descriptors(database, names))
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu = False
     matching.num_threads = _threads()
@@ -328,12 +318,9 @@ def _parts(models: Sequence[Reconstruction]) -> list[set[str]]:
 def _descriptors(database: Path, names: Sequence[str]) -> list[NDArray[np.uint8]]:
     import pycolmap  # pyright: ignore[reportMissingImports]
 
-    opened = pycolmap.Database.open(database)
-    try:
+    with closing(pycolmap.Database.open(database)) as opened:
         numbers = {image.name: image.image_id for image in opened.read_all_images()}
         return [np.asarray(opened.read_descriptors(numbers[name]).data) for name in names]
-    finally:
-        opened.close()
 
 
 def _write(model: Reconstruction, work: Path) -> None:
@@ -354,6 +341,49 @@ def _write(model: Reconstruction, work: Path) -> None:
             pycolmap.undistort_images(
                 work / target, work / "model", work / source, jpeg_quality=_QUALITY, num_threads=_threads()
             )
+
+
+def likely_pairs(descriptors: Sequence[NDArray[np.uint8]]) -> list[tuple[int, int]]:
+    """Returns pairs (earlier, later) of photographs that probably show the same things, sorted by the later one.
+
+    Args:
+        descriptors: ``[n, 128]`` SIFT descriptors of each photograph, in order; ``n`` may be 0.
+    """
+    vectors = _vlad(descriptors)
+    likeness = vectors @ vectors.T
+    count = len(descriptors)
+    pairs = {(i - distance, i) for distance in DISTANCES for i in range(distance, count)}
+    for i in range(count):
+        taken = [i]
+        for j in np.argsort(-likeness[i], kind="stable").tolist():
+            if len(taken) > ALIKE:
+                break
+            if min(abs(j - k) for k in taken) > APART:
+                taken.append(j)
+                pairs.add((min(i, j), max(i, j)))
+    return sorted(pairs, key=lambda pair: pair[::-1])
+
+
+def _vlad(descriptors: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
+    """Returns a unit vector per photograph, ``[N, words * 128]``: summed residuals of features to their words."""
+    everything = np.concatenate([np.zeros((0, 128), np.uint8), *descriptors])
+    if not len(everything):
+        return np.zeros((len(descriptors), 1), np.float32)
+    chosen = np.random.default_rng(SEED).permutation(len(everything))[:SAMPLE]
+    sample = everything[chosen].astype(np.float32)
+    words, _ = kmeans2(sample, sample[:WORDS], ROUNDS, minit="matrix")
+    found = np.zeros((len(descriptors), *words.shape), np.float32)
+    for row, own in enumerate(descriptors):
+        features = own.astype(np.float32)
+        nearest, _ = vq(features, words)
+        np.add.at(found[row], nearest, features - words[nearest])
+    # Normalise the part of each word first, so that none dominates.
+    return _unit(_unit(found).reshape(len(found), -1))
+
+
+def _unit(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
+    length = np.sqrt((vectors**2).sum(-1, keepdims=True, dtype=np.float32))
+    return vectors / np.maximum(length, np.float32(1e-9))
 
 
 def _threads() -> int:

@@ -58,15 +58,10 @@ def trusted(scene: Scene, min_confidence: float | None = None, drop: Sequence[st
         return scene
     known = scene.gaussian_trust
     if known is None or scene.support is None:
-        raise ValueError(
-            "the support of this scene is unknown (it was made in windows): omit --drop and --min-confidence, or "
-            "process all images at once (--window 0)"
-        )
+        raise ValueError("--drop and --min-confidence need the support of a scene, unknown if made in windows: omit "
+            "them, or process all images at once (--window 0)")  # fmt: skip
     if min_confidence is not None and scene.error is None:
-        raise ValueError(
-            "--min-confidence needs stated errors, but this model has no calibration: create one with vg2gt calibrate, "
-            "or use --drop"
-        )
+        raise ValueError("--min-confidence needs a calibration of the model: run vg2gt calibrate, or use --drop")
     unwanted = torch.tensor([NAMES[name] for name in drop])
 
     def stays(error: Tensor | None, status: Tensor) -> Tensor:
@@ -102,14 +97,10 @@ def trust_figures(scene: Scene) -> dict[str, Any]:
     known = scene.gaussian_trust
     if known is None or scene.support is None:
         return {}
-    error, status = known.get("error"), known["support"]
-    figures: dict[str, Any] = {"pixels": _shares(scene.support), "gaussians": _shares(status)}
+    figures: dict[str, Any] = {"pixels": _shares(scene.support), "gaussians": _shares(known["support"])}
     if scene.error is not None and (scene.depth > 0).any():
-        stated = scene.error[scene.depth > 0]
         figures["level"] = STATED
-        figures["error_of_pixels"] = _median(stated)
-    if error is not None and (measured := status >= Status.SINGLE).any():
-        figures["error_of_gaussians"] = _median(error[measured])
+        figures["error_of_pixels"] = float(f"{float(scene.error[scene.depth > 0].median()):.3g}")
     return {"trust": figures}
 
 
@@ -145,7 +136,3 @@ def trust_picture(error: Tensor | None, support: Tensor) -> Tensor:
 
 def _shares(status: Tensor) -> dict[str, float]:
     return {kind.name.lower(): round(float((status == kind).float().mean()), 4) for kind in reversed(Status)}
-
-
-def _median(error: Tensor) -> float:
-    return float(f"{float(error.median()):.3g}")

@@ -16,7 +16,6 @@ from vg2gt.method.additions.surfel import ALONE
 from vg2gt.method.additions.visibility import count_points
 from vg2gt.method.grid import plan_voxels, point_cells, pool_mean
 from vg2gt.refinement.options import Observations
-from vg2gt.refinement.parameters import Parameters
 from vg2gt.rendering import Renderer
 from vg2gt.types import Cameras, Gaussians
 
@@ -88,16 +87,6 @@ def merged(gaussians: Gaussians, cell: float) -> Gaussians:
         plan.batch,
         gaussians.background,
     )
-
-
-def prune(parameters: Parameters, min_opacity: float) -> int:
-    """Removes Gaussians below ``min_opacity``, unless all are; returns their number."""
-    opacities = torch.sigmoid(parameters.values["opacities"].detach())
-    keep = opacities >= min_opacity
-    if keep.all() or not keep.any():
-        return 0
-    parameters.take(keep.nonzero()[:, 0])
-    return int((~keep).sum())
 
 
 @torch.no_grad()

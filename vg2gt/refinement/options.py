@@ -74,6 +74,11 @@ class RefineLoss:
         """Whether any term uses rendered depth or normals."""
         return bool(self.depth_consistency or self.normal_render or self.normal_decoded)
 
+    def with_geometry(self, factor: float) -> RefineLoss:
+        """Returns the loss with the weights of the terms that use depth or normals multiplied."""
+        names = ("depth_consistency", "normal_render", "normal_decoded")
+        return replace(self, **{name: factor * getattr(self, name) for name in names})
+
     def of_views(self, rendered: Render, cameras: Cameras, seen: Observations, unit: float) -> dict[str, Tensor]:
         """Returns the unweighted terms of R rendered views whose weight is not 0, as scalars with autograd graph.
 
@@ -161,8 +166,6 @@ class RefineOptions:
         steps: maximum number of steps; None: end by ``seconds`` or, if that is None too, after 12 renderings of each
             view.
         seconds: maximum time; None: end by ``steps``. On a CPU, a number of steps is reproducible, a time is not.
-        views_per_step: number of views rendered per step.
-        final_rate: factor to which rates decay exponentially.
         check_every: number of steps between checks. In between, some views are left out, in rotation. A check scores
             them and prunes transparent Gaussians.
         holdout: never train on every N-th view, but score it before and after; None: train on all.
@@ -172,8 +175,8 @@ class RefineOptions:
             than agree: Gaussians that a single view supports overfit it. 0: keep all.
         merge_cells: merge Gaussians at the start if at least two, but fewer than ``min_views``, views agree with them,
             in cells this many times as wide as what the median Gaussian covers. 0: remove them.
-        prune_opacity: opacity below which Gaussians are removed.
-        max_growth: maximum number of Gaussians after filling holes, as a multiple of the initial number.
+        geometry_every: render depth and normals in every N-th step only, where the terms that need them count N times;
+            rendering colour alone is faster.
         seed: random seed of the view order.
         rates: learning rates.
         loss: loss to minimise.
@@ -184,16 +187,13 @@ class RefineOptions:
 
     steps: int | None = None
     seconds: float | None = None
-    views_per_step: int = 1
-    final_rate: float = 0.1
     check_every: int = 20
     holdout: int | None = None
     sh_degree: int | None = None
     fill: int = 4
     min_views: int = 0
     merge_cells: float = 0.0
-    prune_opacity: float = 0.02
-    max_growth: float = 1.5
+    geometry_every: int = 1
     seed: int = 0
     rates: RefineRates = field(default_factory=RefineRates)
     loss: RefineLoss = field(default_factory=RefineLoss)
@@ -202,31 +202,23 @@ class RefineOptions:
         for name, good, expected in (
             ("steps", self.steps is None or self.steps >= 1, "at least 1, or null"),
             ("seconds", self.seconds is None or self.seconds > 0, "positive, or null"),
-            ("views_per_step", self.views_per_step >= 1, "at least 1"),
-            ("final_rate", 0 < self.final_rate <= 1, "above 0 and at most 1"),
             ("check_every", self.check_every >= 1, "at least 1"),
             ("holdout", self.holdout is None or self.holdout >= 2, "at least 2, or null"),
             ("sh_degree", self.sh_degree is None or 0 <= self.sh_degree <= MAX_DEGREE, f"0 to {MAX_DEGREE}, or null"),
             ("fill", self.fill >= 0, "at least 0"),
             ("min_views", self.min_views >= 0, "at least 0"),
             ("merge_cells", self.merge_cells >= 0, "at least 0"),
-            ("prune_opacity", 0 <= self.prune_opacity < 1, "at least 0 and below 1"),
-            ("max_growth", self.max_growth >= 1, "at least 1"),
+            ("geometry_every", self.geometry_every >= 1, "at least 1"),
         ):
             if not good:
                 raise ValueError(f"refine.{name} must be {expected}, got {getattr(self, name)}")
 
     def of(self, views: int) -> RefineOptions:
         """Returns the options for this number of trained views, with ``steps`` set if they have no end."""
-        if self.steps is not None or self.seconds is not None:
-            return self
-        return replace(self, steps=-(-RENDERINGS * views // self.views_per_step))
+        endless = self.steps is None and self.seconds is None
+        return replace(self, steps=RENDERINGS * views) if endless else self
 
     def done(self, step: int, seconds: float) -> float:
         """Returns the share of the refinement that is done after ``step`` steps and ``seconds``, at most 1."""
-        shares = [0.0]
-        if self.steps is not None:
-            shares.append(step / self.steps)
-        if self.seconds is not None:
-            shares.append(seconds / self.seconds)
-        return min(1.0, max(shares))
+        limits = ((step, self.steps), (seconds, self.seconds))
+        return min(1.0, max(passed / limit for passed, limit in limits if limit is not None))

@@ -8,15 +8,16 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from vg2gt.geometry.cameras import compose, invert_rigid, transform_points
-from vg2gt.geometry.rotations import matrix_to_quat, multiply_quats, quat_to_matrix
-from vg2gt.geometry.spherical_harmonics import rotation_of_coefficients
+from vg2gt.geometry.alignment import Similarity
+from vg2gt.geometry.cameras import compose, invert_rigid
+from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.refinement.options import RefineRates
 from vg2gt.types import Cameras, Gaussians, TensorRecord
 
 BETAS = (0.9, 0.99)
 HIGHER_BANDS = 0.05  # rate of the higher spherical harmonics relative to that of the constant one
 LOGIT_MARGIN = 1e-4
+TRANSPARENT = 0.02  # opacity below which Gaussians are removed
 OF_GAUSSIANS = ("means", "quats", "scales", "opacities", "sh", "sh_rest")
 
 
@@ -38,19 +39,13 @@ class RefinedScene(TensorRecord):
 
     def seen_from(self, first: Tensor) -> RefinedScene:
         """Returns the same scene, with the same renderings, in the world where view 0 has the pose ``first [4, 4]``."""
-        found, gaussians = self.cameras.world_to_camera[0], self.gaussians
+        found = self.cameras.world_to_camera[0]
         back = compose(invert_rigid(found[0]), first)  # from the new world to the old one
-        move = invert_rigid(back)
-        turn = move[:3, :3]
-        degree = round(gaussians.sh.shape[1] ** 0.5) - 1
-        moved = replace(
-            gaussians,
-            means=transform_points(move[None, None], gaussians.means[None, None])[0, 0],
-            quats=multiply_quats(matrix_to_quat(turn)[None], gaussians.quats),
-            sh=rotation_of_coefficients(turn, degree) @ gaussians.sh,
-        )
+        move = invert_rigid(back)[None]
+        similarity = Similarity(torch.ones_like(move[:, 0, 0]), move[:, :3, :3], move[:, :3, 3])
         poses = torch.cat((first[None], compose(found[1:], back)))
-        return replace(self, gaussians=moved, cameras=replace(self.cameras, world_to_camera=poses[None]))
+        cameras = replace(self.cameras, world_to_camera=poses[None])
+        return replace(self, gaussians=similarity.apply_gaussians(self.gaussians), cameras=cameras)
 
     def exposed(self, color: Tensor, views: Tensor) -> Tensor:
         """Applies the exposure of the views ``[R]`` to rendered colours ``[1, R, 3, H, W]``."""
@@ -141,18 +136,20 @@ class Parameters:
         return True
 
     @torch.no_grad()
-    def take(self, rows: Tensor) -> None:
-        """Keeps the Gaussians ``rows``, in that order and possibly repeated, with their Adam state."""
-        self.origin, self.unit, self.size = self.origin[rows], self.unit[rows], self.size[rows]
+    def prune(self) -> None:
+        """Removes transparent Gaussians with their Adam state, unless all are."""
+        keep = torch.sigmoid(self.values["opacities"]) >= TRANSPARENT
+        if keep.all() or not keep.any():
+            return
+        self.origin, self.unit, self.size = self.origin[keep], self.unit[keep], self.size[keep]
         groups = {group["name"]: group for group in self.optimizer.param_groups}
         for name in OF_GAUSSIANS:
             before = self.values[name]
-            after = before[rows].detach()
-            self.values[name] = after
+            after = self.values[name] = before[keep].detach()
             if name not in groups:
                 continue
             groups[name]["params"][0] = after.requires_grad_(True)
             state = self.optimizer.state.pop(before, None)
             if state is not None:
-                moments = {key: state[key][rows] for key in ("exp_avg", "exp_avg_sq")}
+                moments = {key: state[key][keep] for key in ("exp_avg", "exp_avg_sq")}
                 self.optimizer.state[after] = {"step": state["step"], **moments}

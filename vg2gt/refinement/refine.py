@@ -13,8 +13,8 @@ from torch import Tensor
 
 from vg2gt.losses.gaussian import where_it_counts
 from vg2gt.metrics import psnr
-from vg2gt.refinement.density import fill_holes, prune, supported
-from vg2gt.refinement.options import Observations, RefineOptions
+from vg2gt.refinement.density import fill_holes, supported
+from vg2gt.refinement.options import Observations, RefineLoss, RefineOptions
 from vg2gt.refinement.parameters import Parameters, RefinedScene
 from vg2gt.rendering import Renderer
 from vg2gt.types import Cameras, Gaussians
@@ -22,7 +22,8 @@ from vg2gt.types import Cameras, Gaussians
 log = logging.getLogger(__name__)
 
 WORSE = 2.0  # loss of left-out views, relative to the start and to the best state, that counts as divergence
-RETREATS = 4  # maximum number of retreats; each halves the rates
+FINAL_RATE = 0.1  # factor to which rates decay exponentially
+MAX_GROWTH = 1.5  # maximum number of Gaussians after filling holes, as a multiple of the initial number
 FEWEST = 4  # with fewer views, none is left out
 LEFT_OUT = 8  # one view in this many is left out at a time
 SMOOTH = 3  # number of checks to average, since each scores other views
@@ -42,7 +43,6 @@ class Refined:
         psnr: ``[2, V]`` PSNR of every view before and after, in dB.
         trained: ``[N]`` views that were trained on.
         held_out: ``[V - N]`` the other views.
-        retreats: number of returns to the best state.
     """
 
     start: RefinedScene
@@ -54,7 +54,6 @@ class Refined:
     psnr: Tensor
     trained: Tensor
     held_out: Tensor
-    retreats: int = 0
 
 
 def refine(
@@ -68,8 +67,7 @@ def refine(
 ) -> Refined:
     """Optimises one scene on the images of its views.
 
-    Ctrl-C ends it and returns the best state so far. If the loss is not finite or diverges, refinement resumes from the
-    best state with half the rates and logs a warning.
+    Ctrl-C ends it and returns the best state so far; so does a loss that is not finite or diverges, with a warning.
 
     Args:
         gaussians: the scene (B = 1).
@@ -85,7 +83,15 @@ def refine(
         ValueError: if there are no Gaussians, or images and cameras do not match.
     """
     options = options or RefineOptions()
-    _check(gaussians, cameras, seen)
+    views, height, width = seen.depth.shape
+    found = (tuple(cameras.world_to_camera.shape[:2]), tuple(cameras.size), tuple(seen.images.shape))
+    if found != ((1, views), (height, width), (views, 3, height, width)) or seen.depth_conf.shape != seen.depth.shape:
+        raise ValueError(
+            f"refinement needs one scene with matching images, depth and cameras, got cameras {found[0]} of size "
+            f"{found[1]}, images {found[2]}, depth {tuple(seen.depth.shape)}, confidence {tuple(seen.depth_conf.shape)}"
+        )
+    if not len(gaussians):
+        raise ValueError("there are no Gaussians to refine")
     with torch.enable_grad():
         return _Refinement(gaussians, cameras, seen, renderer, options, clock).run(observe)
 
@@ -102,14 +108,14 @@ class _Refinement:
     ) -> None:
         self.seen, self.renderer, self.clock = seen, renderer, clock
         self.began = clock()
-        self.trainer = renderer if options.loss.needs_geometry else replace(renderer, geometry=False)
         self.order = ViewOrder(len(seen.images), options.holdout, options.seed)
         self.trained = self.order.trained.to(seen.images.device)
         self.options = options.of(len(self.order.trained))
         start = gaussians
         if options.min_views:
             start = supported(gaussians, cameras, seen.depth, options.min_views, options.merge_cells)
-        self.depth = _median_depth(start, cameras, seen)
+        visible = seen.depth[seen.depth > 0]
+        self.depth = float(visible.median()) if len(visible) else 1.0
         self.pixel = 1 / float(cameras.intrinsics[..., [0, 1], [0, 1]].mean())
         ones = torch.ones_like(seen.images[:, :, 0, 0])
         self.given, self.start = (
@@ -122,13 +128,13 @@ class _Refinement:
         self.best, self.best_score, self.best_step = self.start, 1.0, 0
         self.scores: list[float] = []
         self.recent: list[float] = []
-        self.factor, self.retreats, self.steps = 1.0, 0, 0
+        self.steps = 0
         begun = self.start
         if options.fill:
-            room = int(options.max_growth * len(start)) - len(start)
+            room = int(MAX_GROWTH * len(start)) - len(start)
             filled = fill_holes(begun.gaussians, cameras, seen, renderer, self.trained, options.fill, room)
             begun = replace(begun, gaussians=filled)
-        self.parameters = self._parameters(begun)
+        self.parameters = Parameters(begun, options.rates, self.pixel, self.depth, self.trained)
 
     def run(self, observe: Callable[[int, float, float], None] | None) -> Refined:
         """Runs steps and checks until the refinement ends."""
@@ -161,42 +167,38 @@ class _Refinement:
             psnr=torch.stack((self.given_psnr, after)),
             trained=self.order.trained,
             held_out=self.order.held_out,
-            retreats=self.retreats,
         )
-
-    def _parameters(self, scene: RefinedScene) -> Parameters:
-        return Parameters(scene, self.options.rates, self.pixel, self.depth, self.trained)
 
     def _done(self) -> float:
         return self.options.done(self.steps, self.clock() - self.began)
 
     def _step(self) -> str:
         """Runs one step, and a check if one is due; returns how the refinement ended, or an empty string."""
-        views = self.order.deal(self.options.views_per_step).to(self.seen.images.device)
         scene = self.parameters.scene()
-        loss, images = self._loss(scene, views)
-        if terms := self.options.loss.of_gaussians(scene.gaussians, self.parameters.size):
-            loss = loss + self.options.loss.total(terms)
+        every = self.options.geometry_every
+        of_step = self.options.loss.with_geometry(0 if self.steps % every else every)
+        loss, images = self._loss(scene, self.order.deal().to(self.seen.images.device), of_step)
+        if terms := of_step.of_gaussians(scene.gaussians, self.parameters.size):
+            loss = loss + of_step.total(terms)
         self.recent.append(float(images.mean()))
         self.steps += 1
-        rate = self.factor * self.options.final_rate ** self._done()
-        if not self.parameters.step(loss, rate):
-            return self._retreat("the loss or its gradient is not finite")
+        if not self.parameters.step(loss, FINAL_RATE ** self._done()):
+            return self._diverged("the loss or its gradient is not finite")
         done = self._done()
         if done < 1 and self.steps % self.options.check_every:
             return ""
         if trouble := self._check():
-            return self._retreat(trouble)
+            return self._diverged(trouble)
         if done < 1:
-            prune(self.parameters, self.options.prune_opacity)
+            self.parameters.prune()
             self.order.next_round()
             return ""
         return "steps" if self.steps == self.options.steps else "seconds"
 
-    def _loss(self, scene: RefinedScene, views: Tensor) -> tuple[Tensor, Tensor]:
+    def _loss(self, scene: RefinedScene, views: Tensor, loss: RefineLoss) -> tuple[Tensor, Tensor]:
         """Returns the loss of some views, and their PSNR ``[R]``."""
-        loss, cameras, seen = self.options.loss, scene.cameras.select(views), self.seen.views(views)
-        rendered = self.trainer(scene.gaussians, cameras)
+        cameras, seen = scene.cameras.select(views), self.seen.views(views)
+        rendered = replace(self.renderer, geometry=loss.needs_geometry)(scene.gaussians, cameras)
         color = where_it_counts(scene.exposed(rendered.color, views)[0], seen.images, seen.mask)
         rendered = replace(rendered, color=color[None])
         terms = loss.of_views(rendered, cameras, seen, self.depth)
@@ -205,7 +207,7 @@ class _Refinement:
     @torch.no_grad()
     def _score(self, scene: RefinedScene, views: Tensor) -> tuple[Tensor, Tensor]:
         """Returns loss and PSNR ``[R]`` of views, each rendered on its own."""
-        found = [self._loss(scene, view) for view in views.to(self.seen.images.device).split(1)]
+        found = [self._loss(scene, view, self.options.loss) for view in views.to(self.seen.images.device).split(1)]
         return torch.stack([loss for loss, _ in found]).cpu(), torch.cat([image for _, image in found]).cpu()
 
     def _check(self) -> str:
@@ -226,19 +228,9 @@ class _Refinement:
             self.best, self.best_score, self.best_step = scene, smooth, self.steps
         return ""
 
-    def _retreat(self, trouble: str) -> str:
-        """Returns to the best state with half the rates, or ends the refinement after too many retreats."""
-        self.retreats += 1
-        if self.retreats > RETREATS or self._done() >= 1:
-            return "diverged"
-        self.factor /= 2
-        log.warning(
-            "refinement, step %d: %s; resuming from step %d with learning rates scaled by %g",
-            self.steps, trouble, self.best_step, self.factor,
-        )  # fmt: skip
-        self.parameters = self._parameters(self.best)
-        self.scores = []
-        return ""
+    def _diverged(self, trouble: str) -> str:
+        log.warning("refinement, step %d: %s; the result is step %d", self.steps, trouble, self.best_step)
+        return "diverged"
 
 
 class ViewOrder:
@@ -267,19 +259,15 @@ class ViewOrder:
         """Moves on to the next views to leave out."""
         self.left_out = next(self._left_out)
 
-    def deal(self, count: int) -> Tensor:
-        """Returns the next views, at most ``count`` different ones, sorted."""
-        hidden = set(self.left_out.tolist())
-        count = min(count, len(self.trained) - len(hidden))
-        dealt: list[int] = []
-        while len(dealt) < count:
+    def deal(self) -> Tensor:
+        """Returns the next view ``[1]``."""
+        while True:
             if not self._hand:
                 order = torch.randperm(len(self.trained), generator=self._generator)
                 self._hand = self.trained[order].tolist()
             view = self._hand.pop()
-            if view not in hidden and view not in dealt:
-                dealt.append(view)
-        return torch.tensor(sorted(dealt))
+            if view not in self.left_out.tolist():
+                return torch.tensor([view])
 
     def _rotation(self) -> Iterator[Tensor]:
         if len(self.trained) < FEWEST:
@@ -288,27 +276,6 @@ class ViewOrder:
         order = self.trained[torch.randperm(len(self.trained), generator=self._generator)]
         while True:
             yield from order.split(-(-len(order) // LEFT_OUT))
-
-
-def _check(gaussians: Gaussians, cameras: Cameras, seen: Observations) -> None:
-    views, height, width = seen.depth.shape
-    found = (tuple(cameras.world_to_camera.shape[:2]), tuple(cameras.size), tuple(seen.images.shape))
-    if found != ((1, views), (height, width), (views, 3, height, width)) or seen.depth_conf.shape != seen.depth.shape:
-        raise ValueError(
-            f"refinement needs one scene with matching images, depth and cameras, got cameras {found[0]} of size "
-            f"{found[1]}, images {found[2]}, depth {tuple(seen.depth.shape)}, confidence {tuple(seen.depth_conf.shape)}"
-        )
-    if not len(gaussians):
-        raise ValueError("there are no Gaussians to refine")
-
-
-def _median_depth(gaussians: Gaussians, cameras: Cameras, seen: Observations) -> float:
-    visible = seen.depth[seen.depth > 0]
-    if len(visible):
-        return float(visible.median())
-    pose = cameras.world_to_camera[0]
-    depth = torch.einsum("vj,gj->vg", pose[:, 2, :3], gaussians.means) + pose[:, 2, 3:]
-    return float(depth[depth > 0].median()) if (depth > 0).any() else 1.0
 
 
 def _with_degree(gaussians: Gaussians, degree: int | None) -> Gaussians:

@@ -17,6 +17,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -190,7 +191,7 @@ def _halves(samples: Samples) -> tuple[Samples, Samples]:
 
 def _fit(order: Samples, meaning: Samples) -> Curve:
     """Fits a curve: one half of the pixels ranks the evidence, the other calibrates the bounds."""
-    knots = tuple(_knots(column, name) for column, name in zip(_thin(order.evidence).unbind(-1), EVIDENCE, strict=True))
+    knots = tuple(_knots(column, name) for column, name in zip(order.evidence.unbind(-1), EVIDENCE, strict=True))
     basis = torch.cat(
         [_hats(column.double(), k) for column, k in zip(order.evidence.unbind(-1), knots, strict=True)], 1
     )
@@ -212,8 +213,8 @@ def _fit(order: Samples, meaning: Samples) -> Curve:
 
 def _knots(column: Tensor, name: str) -> Tensor:
     """Returns increasing quantiles ``[K]`` of one kind of evidence."""
-    steps = torch.linspace(0, 1, SCENE_KNOTS if name == "differences" else KNOTS, dtype=torch.float64)
-    return column.double().quantile(steps).unique()
+    steps = np.linspace(0, 1, SCENE_KNOTS if name == "differences" else KNOTS)
+    return torch.from_numpy(np.quantile(column.double().numpy(), steps)).unique()
 
 
 def _increasing(values: Tensor) -> Tensor:
@@ -236,11 +237,6 @@ def _interpolate(places: Tensor, knots: Tensor, values: Tensor) -> Tensor:
     return torch.lerp(values[right - 1], values[right], share)
 
 
-def _thin(rows: Tensor, most: int = 1_000_000) -> Tensor:
-    """Returns at most ``most`` rows, evenly spread: :func:`torch.quantile` has a limit."""
-    return rows[:: max(1, -(-len(rows) // most))]
-
-
 def _list(values: Tensor) -> list[float]:
     return [float(f"{value:.6g}") for value in values.tolist()]
 
@@ -249,8 +245,8 @@ def _curve(content: Mapping[str, Any]) -> Curve:
     knots, values = (tuple(torch.tensor(part) for part in content[name]) for name in ("knots", "values"))
     scores, bounds = (torch.tensor(content[name]) for name in ("scores", "bounds"))
     shapes = [part.shape for part in values] == [part.shape for part in knots]
-    if len(knots) != len(EVIDENCE) or not shapes or bounds.shape != (len(LEVELS), len(scores)):
-        raise ValueError("its arrays have inconsistent shapes")
-    if not all(part.isfinite().all() for part in (*knots, *values, scores, bounds)) or not (bounds > 0).all():
-        raise ValueError("it holds values that are not finite and positive")
+    shapes = shapes and len(knots) == len(EVIDENCE) and bounds.shape == (len(LEVELS), len(scores))
+    finite = all(part.isfinite().all() for part in (*knots, *values, scores, bounds)) and (bounds > 0).all()
+    if not (shapes and finite):
+        raise ValueError("its arrays have inconsistent shapes, or values that are not finite and positive")
     return Curve(knots, values, scores, bounds)

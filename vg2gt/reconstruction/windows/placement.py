@@ -17,7 +17,7 @@ from torch import Tensor
 from vg2gt.geometry.alignment import Similarity, align_cameras, fit_depth_scale, weighted_median
 from vg2gt.geometry.cameras import camera_centers, relative_to_first
 from vg2gt.method.additions.visibility.counts import count_views
-from vg2gt.reconstruction.windows.capture import Window
+from vg2gt.reconstruction.windows.store import Window
 from vg2gt.types import Cameras
 
 PARAMETERS = 7  # per window: log scale, rotation vector, translation
@@ -55,8 +55,8 @@ class Found:
         return replace(chosen, world_to_camera=chosen.world_to_camera.double()), self.depth[rows]
 
 
-def place_windows(windows: Sequence[Found], loops: Sequence[Found] = ()) -> Similarity:
-    """Returns similarities ``[n]`` (float64) from the windows to the frame and unit of the first.
+def place_windows(windows: Sequence[Found], loops: Sequence[Found] = ()) -> list[Similarity]:
+    """Returns the similarity (float64, B = 1) of each window to the frame and unit of the first.
 
     Args:
         windows: in order, each sharing views with the next.
@@ -79,9 +79,10 @@ def place_windows(windows: Sequence[Found], loops: Sequence[Found] = ()) -> Simi
         if largest < CONTRADICTS:
             poses, edges = tried, more
             nodes.append(loop)
-    poses = poses[: len(windows)]
-    rotation = Rotation.from_rotvec(poses[:, 1:4]).as_matrix()
-    return Similarity(*(torch.from_numpy(part) for part in (np.exp(poses[:, 0]), rotation, poses[:, 4:].copy())))
+    rotations = Rotation.from_rotvec(poses[:, 1:4]).as_matrix()
+    parts = zip(np.exp(poses[:, :1]), rotations, poses[:, 4:], strict=True)
+    moves = [Similarity(*map(torch.tensor, (scale, turn[None], shift[None]))) for scale, turn, shift in parts]
+    return moves[: len(windows)]
 
 
 def _solved(
@@ -196,59 +197,43 @@ def _inverse(move: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.concatenate(([-move[0]], turn.as_rotvec(), -np.exp(-move[0]) * turn.apply(move[4:])))[None]
 
 
-@dataclass(frozen=True)
-class Placement:
-    """Cameras of all views in one frame: that of the given cameras, or the first window's.
+def seen_from(reference: Tensor, cameras: Cameras) -> Cameras:
+    """Returns cameras in the frame of a camera with the pose ``[4, 4]``, float32.
 
-    Attributes:
-        cameras: ``[1, V]``.
-        scales: ``[V]`` float32 factors from the unit of a view's window to that of the cameras.
+    They are computed in float64 first; the reference itself becomes exactly the identity.
     """
-
-    cameras: Cameras
-    scales: Tensor
-
-    def seen_from(self, reference: Tensor) -> Cameras:
-        """Returns the cameras in the frame of a camera with the pose ``[4, 4]``, float32.
-
-        They are computed in float64 first; the reference itself becomes exactly the identity.
-        """
-        poses = self.cameras.world_to_camera
-        reference = reference.to(poses)
-        first = torch.cat((reference[None, None], poses), 1).double()
-        seen = relative_to_first(replace(self.cameras, world_to_camera=first)).world_to_camera[:, 1:].float()
-        same = (poses == reference).all(-1).all(-1)[..., None, None]
-        return replace(self.cameras, world_to_camera=torch.where(same, torch.eye(4), seen))
+    poses = cameras.world_to_camera
+    reference = reference.to(poses)
+    first = torch.cat((reference[None, None], poses), 1).double()
+    seen = relative_to_first(replace(cameras, world_to_camera=first)).world_to_camera[:, 1:].float()
+    same = (poses == reference).all(-1).all(-1)[..., None, None]
+    return replace(cameras, world_to_camera=torch.where(same, torch.eye(4), seen))
 
 
-def moves_onto(found: Sequence[Found], given: Cameras) -> Similarity:
-    """Returns the similarities ``[n]`` (float64) that align each window's cameras with the given ones."""
-    moves = []
-    for window in found:
-        there = given.select(window.views)
-        exact = replace(there, world_to_camera=there.world_to_camera.double())
-        moves.append(align_cameras(window.exact(window.views)[0], exact))
-    return Similarity(
-        *(torch.cat([getattr(move, part) for move in moves]) for part in ("scale", "rotation", "translation"))
-    )
+def moves_onto(found: Sequence[Found], given: Cameras) -> list[Similarity]:
+    """Returns the similarity (float64, B = 1) that aligns each window's cameras with the given ones."""
+    exact = replace(given, world_to_camera=given.world_to_camera.double())
+    return [align_cameras(window.exact(window.views)[0], exact.select(window.views)) for window in found]
 
 
 def place_found(
-    found: Sequence[Found], moves: Similarity, windows: Sequence[Window], size: tuple[int, int]
-) -> Placement:
+    found: Sequence[Found], moves: Sequence[Similarity], windows: Sequence[Window], size: tuple[int, int]
+) -> tuple[Cameras, Tensor]:
     """Places windows whose backbone predicts cameras.
 
     Args:
         found: prediction for each window.
-        moves: similarity of each window into one frame.
+        moves: similarity of each window into one frame (B = 1).
         windows: the windows.
         size: ``(height, width)`` of the images.
+
+    Returns:
+        Cameras ``[1, V]`` in that frame, and factors ``[V]`` float32 from the unit of a view's window to theirs.
     """
     poses, intrinsics, scales = [], [], []
-    for number, (each, window) in enumerate(zip(found, windows, strict=True)):
-        move = moves.map(lambda tensor, number=number: tensor[number, None])
+    for each, move, window in zip(found, moves, windows, strict=True):
         moved = move.apply_cameras(each.exact(each.views)[0]).world_to_camera
         poses.append(moved[:, window.inner])
         intrinsics.append(each.intrinsics[:, window.inner])
         scales.append(move.scale.float().expand(window.own.stop - window.own.start))
-    return Placement(Cameras(torch.cat(poses, 1), torch.cat(intrinsics, 1), size), torch.cat(scales))
+    return Cameras(torch.cat(poses, 1), torch.cat(intrinsics, 1), size), torch.cat(scales)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from vg2gt.geometry.cameras import crop_intrinsics, scale_translations
 from vg2gt.geometry.precision import half_precision_on_gpu
+from vg2gt.io.files import write_json
 from vg2gt.io.tensors import read_tensors
 from vg2gt.memory import note_sizes
 from vg2gt.method.additions.visibility.blocks import check_blocks, coarsening
@@ -20,21 +21,31 @@ from vg2gt.method.additions.visibility.check import choose_partners
 from vg2gt.method.fine import FineModule
 from vg2gt.method.grid import scene_voxel_size
 from vg2gt.model import VG2GT, Reconstructor, background_sums
-from vg2gt.reconstruction.inputs import Views, thumbnails, working_order
+from vg2gt.reconstruction.inputs import thumbnails, working_order
 from vg2gt.reconstruction.monitor import Monitor
 from vg2gt.reconstruction.pictures import Picture
-from vg2gt.reconstruction.windows.capture import Capture, Window, cut
 from vg2gt.reconstruction.windows.placement import (
     Found,
-    Placement,
     closes,
     loop_candidates,
     moves_onto,
     place_found,
     place_windows,
+    seen_from,
 )
-from vg2gt.reconstruction.windows.store import Anchor, WindowStore, finished_sets, key_of, merge_windows
-from vg2gt.types import Cameras, Gaussians, Geometry, Hints, Tokens
+from vg2gt.reconstruction.windows.store import (
+    ANCHOR,
+    SET,
+    Anchor,
+    Capture,
+    Window,
+    WindowStore,
+    cut,
+    finished_sets,
+    key_of,
+    merge_windows,
+)
+from vg2gt.types import Cameras, Gaussians, Geometry, Tokens
 
 TOKEN_BYTES = 4e9  # maximum size of all windows' tokens on disk; if larger, the backbone runs a second time instead
 REDUCED = 4  # pixel stride of the depth that places windows
@@ -89,6 +100,7 @@ class WindowRun:
         self.store = WindowStore(folder, set_key(model, pictures, size, window, anchor))
         self.capture = Capture(self.store, pictures, size, monitor)
         self.windows = cut(len(pictures), window)
+        self.blocks = [each.own for each in self.windows]
         shape = (self.count, *size)
         self.raw, self.conf = (self.store.array(name, shape) for name in ("raw_depth", "depth_conf"))
         self.depth = self.store.array("depth", shape)
@@ -96,20 +108,19 @@ class WindowRun:
     def geometry_and_gaussians(self) -> tuple[Geometry, Gaussians, Tensor]:
         """Returns the geometry of all views, with depth only where the scene uses it, the Gaussians, and the unit."""
         surveyed, anchor = self.survey(), self.anchor
-        placement = self._placement(surveyed)
-        # windows' units to the placement's unit: [V, H, W]
-        metres = torch.cat([each["scale"] for each in surveyed])
-        metres = metres / placement.scales[[rows.start for rows in self._blocks()]]
-        for rows in self._blocks():
-            self.depth[rows] = self.raw[rows] * placement.scales[rows, None, None]
+        cameras, scales = self._placement(surveyed)
+        # windows' units to the cameras' unit: [V, H, W]
+        metres = torch.cat([each["scale"] for each in surveyed]) / scales[[rows.start for rows in self.blocks]]
+        for rows in self.blocks:
+            self.depth[rows] = self.raw[rows] * scales[rows, None, None]
         if anchor is None:
-            reference = placement.cameras.world_to_camera[0, working_order(self.capture.images)[0]]
+            reference = cameras.world_to_camera[0, working_order(self.capture.images)[0]]
         else:
             reference = torch.from_numpy(anchor.reference)
-        # placement's frame and unit to the scene's
-        geometry = Geometry(self.depth[None], self.conf[None], placement.seen_from(reference), metres.median()[None])
+        # the cameras' frame and unit to the scene's
+        geometry = Geometry(self.depth[None], self.conf[None], seen_from(reference, cameras), metres.median()[None])
         unit = self.model.scale(_sampled(geometry), None) if anchor is None else torch.tensor([anchor.unit])
-        for rows in self._blocks():
+        for rows in self.blocks:
             self.depth[rows] *= unit
         geometry = replace(geometry, cameras=scale_translations(geometry.cameras, unit), scale=geometry.scale / unit)
         # visibility check, fine voxels of each window, Gaussians of all windows
@@ -119,22 +130,12 @@ class WindowRun:
             for other in finished_sets(self.folder):
                 if other != self.store.folder:
                     shutil.rmtree(other)
-            anchor.write(self.folder)
+            write_json(self.folder / ANCHOR, anchor.plain())
         self.anchor = anchor
         self._pool(geometry, torch.tensor([anchor.voxel_size]))
-        self.store.finish()
+        write_json(self.store.folder / SET, {"finished": True})
         geometry = replace(geometry, cameras=geometry.cameras.to(self.device))
         return geometry, gaussians_of(self.model, self.folder, anchor, self.monitor), unit
-
-    def views(self) -> Views:
-        """Returns the input, memory-mapped from files."""
-        capture = self.capture
-        names = tuple(picture.name for picture in capture.pictures)
-        hints = Hints(frame_ids=torch.arange(self.count)[None])
-        return Views(capture.images, names, hints, capture.mask, tuple(capture.pictures))
-
-    def _blocks(self) -> list[slice]:
-        return [window.own for window in self.windows]
 
     def survey(self) -> list[dict[str, Tensor]]:
         """Computes the depth of all views in their windows' units; returns what is needed to place each window."""
@@ -160,7 +161,7 @@ class WindowRun:
         rows = [each["descriptors"][w.inner] for each, w in zip(surveyed, self.windows, strict=True)]
         each = len(self.windows) // 4 + 1  # tokens capture content; thumbnails do not depend on a window's frame
         alike = (thumbnails(self.capture.images), torch.cat(rows))
-        pairs = list(dict.fromkeys(p for described in alike for p in loop_candidates(described, self._blocks(), each)))
+        pairs = list(dict.fromkeys(p for described in alike for p in loop_candidates(described, self.blocks, each)))
         half, found = len(self.windows[0].views) // 2, []
         with self.monitor.stage("close loops", len(pairs)) as advance:
             for number, pair in enumerate(pairs):
@@ -210,10 +211,10 @@ class WindowRun:
         grid = (height // self.model.backend.patch_size, width // self.model.backend.patch_size)
         return Tokens(patch, patch[-1][:, :, 0], grid, self.capture.size)
 
-    def _placement(self, surveyed: list[dict[str, Tensor]]) -> Placement:
+    def _placement(self, surveyed: list[dict[str, Tensor]]) -> tuple[Cameras, Tensor]:
         given = self.capture.given
         if given is not None and not self.model.backend.predicts_cameras:
-            return Placement(given, torch.ones(self.count))
+            return given, torch.ones(self.count)
         found = [found_of(each) for each in surveyed]
         moves = place_windows(found, self.loops(surveyed)) if given is None else moves_onto(found, given)
         return place_found(found, moves, self.windows, self.capture.size)
@@ -226,14 +227,14 @@ class WindowRun:
             with self.monitor.stage("views check views", check.rounds * len(self.windows)) as advance:
                 partners = choose_partners(self.depth, geometry.cameras, check.partners)
                 coarsen = coarsening(check, self.depth, geometry.cameras, partners)
-                for _ in check_blocks(check, self.depth, geometry.cameras, partners, self._blocks(), masks):
+                for _ in check_blocks(check, self.depth, geometry.cameras, partners, self.blocks, masks):
                     advance()
-            for rows in self._blocks():
+            for rows in self.blocks:
                 self.depth[rows] *= masks[0][rows]
         return scene_voxel_size(_sampled(geometry), fine.voxel_size, fine.min_footprint, coarsen)
 
     def _pool(self, geometry: Geometry, size: Tensor) -> None:
-        sums = [background_sums(self.capture.images[None, rows], self.raw[None, rows]) for rows in self._blocks()]
+        sums = [background_sums(self.capture.images[None, rows], self.raw[None, rows]) for rows in self.blocks]
         total, weight = (torch.stack(parts).sum(0) for parts in zip(*sums, strict=True))
         self.store.save("background", {"total": total, "weight": weight})
         with self.monitor.stage("fine voxels", len(self.windows)) as advance:

@@ -1,4 +1,4 @@
-"""Files of a reconstruction in windows: arrays of all views, results of finished steps, and voxels of image sets.
+"""The views of a long capture, the files of its reconstruction in windows, and the voxels of its sets of images.
 
 Each command adds or removes one set of images through the voxels that it pooled.
 """
@@ -6,10 +6,11 @@ Each command adds or removes one set of images through the voxels that it pooled
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -22,20 +23,25 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from vg2gt.io.errors import FormatError
-from vg2gt.io.files import by_number, read_json, replacing, write_json
+from vg2gt.io.files import read_json, replacing, write_json
 from vg2gt.io.tensors import read_tensors
 from vg2gt.method.pooled import PooledVoxels, concatenate, merge
 from vg2gt.model import Reconstructor
+from vg2gt.reconstruction.inputs import depth_range, given_poses, load_views, source_of
 from vg2gt.reconstruction.monitor import Monitor
-from vg2gt.reconstruction.scene import Scene
-from vg2gt.types import Cameras
+from vg2gt.reconstruction.pictures import Picture
+from vg2gt.types import Cameras, Hints
 
 FORMAT = 1
 """Version of the folder's format; increment it when the format changes."""
 SET = "set.json"  # marks the folder of a set; says whether it is finished
-_ANCHOR = "scene.json"
+ANCHOR = "scene.json"
 _KEPT = ("voxels-", "background", SET)  # prefixes of the files that a finished set needs
 ROWS = 400_000  # voxels merged at a time
+AUTOMATIC = 100  # number of views above which a capture is processed in windows
+SIZE = 24  # own views per window
+MARGIN = 6  # minimum number of neighbours before and after them; a sixth of large windows
+AT_ONCE = 16  # pictures decoded per finished step
 _PLAIN = (bool, int, float, str, tuple, type(None))
 
 
@@ -51,10 +57,6 @@ class WindowStore:
         self.folder = folder / key[:12]
         if not (self.folder / SET).is_file():
             write_json(self.folder / SET, {"finished": False})
-
-    def finish(self) -> None:
-        """Marks the set as finished."""
-        write_json(self.folder / SET, {"finished": True})
 
     def array(self, name: str, shape: Sequence[int] | None = None, fill: float = 0) -> Tensor:
         """Returns a memory-mapped float32 array of the folder; writing to the tensor writes to the file.
@@ -75,21 +77,17 @@ class WindowStore:
 
     def has(self, name: str) -> bool:
         """Returns whether an array or a finished step of this name exists."""
-        return (self.folder / f"{name}.npy").is_file() or self.step(name).is_file()
-
-    def step(self, name: str) -> Path:
-        """Returns the file of a finished step."""
-        return self.folder / f"{name}.safetensors"
+        return any((self.folder / f"{name}.{suffix}").is_file() for suffix in ("npy", "safetensors"))
 
     def save(self, name: str, tensors: Mapping[str, Tensor]) -> None:
         """Writes the result of a step, completely or not at all."""
-        with replacing(self.step(name)) as temporary:
+        with replacing(self.folder / f"{name}.safetensors") as temporary:
             save_file({key: value.detach().cpu().contiguous() for key, value in tensors.items()}, temporary)
 
     def load(self, name: str) -> dict[str, Tensor] | None:
         """Reads the result of a step; None if it is not finished."""
         try:
-            return read_tensors(self.step(name))
+            return read_tensors(self.folder / f"{name}.safetensors")
         except (FileNotFoundError, FormatError):
             return None
 
@@ -182,10 +180,6 @@ class Anchor:
         """Returns the attributes as JSON values."""
         return vars(self) | {"reference": self.reference.tolist()}
 
-    def write(self, folder: Path) -> None:
-        """Writes the anchor into the folder of the sets."""
-        write_json(folder / _ANCHOR, self.plain())
-
 
 def read_anchor(folder: Path) -> Anchor:
     """Reads the anchor of a scene.
@@ -193,11 +187,11 @@ def read_anchor(folder: Path) -> Anchor:
     Raises:
         FileNotFoundError: if there is none; the message names the remedy.
     """
-    if not (folder / _ANCHOR).is_file():
+    if not (folder / ANCHOR).is_file():
         raise FileNotFoundError(
             f"{folder} contains no voxels of a scene: reconstruct it with --window N --keep-windows and given cameras"
         )
-    found: dict[str, Any] = read_json(folder / _ANCHOR)
+    found: dict[str, Any] = read_json(folder / ANCHOR)
     return Anchor(**found | {"reference": np.array(found["reference"]), "size": tuple(found["size"])})
 
 
@@ -217,49 +211,112 @@ def tidy(folder: Path) -> None:
             file.unlink()
 
 
-def joined(old: Scene, new: Scene) -> Scene:
-    """Joins the views of two scenes in one frame, sorted by name, with the Gaussians of the second."""
-    names = (*old.names, *new.names)
-    order = torch.tensor(sorted(range(len(names)), key=lambda view: by_number(names[view])))
-    masks = [torch.ones_like(each.depth) if each.mask is None else each.mask for each in (old, new)]
+@dataclass(frozen=True, eq=False)
+class Window:
+    """Views that go through the model together.
 
-    def both(one: Tensor, other: Tensor) -> Tensor:
-        return torch.cat((one.cpu(), other.cpu()))[order]
+    Attributes:
+        views: ``[n]`` indices of all its views, ascending.
+        own: range of the views that enter the scene from this window; the others are their neighbours.
+    """
 
-    poses, intrinsics = (
-        both(getattr(old.cameras, name)[0], getattr(new.cameras, name)[0])[None]
-        for name in ("world_to_camera", "intrinsics")
-    )
-    return replace(
-        new,
-        cameras=Cameras(poses, intrinsics, new.cameras.size).to(new.cameras.world_to_camera.device),
-        images=both(old.images, new.images),
-        depth=both(old.depth, new.depth),
-        depth_conf=both(old.depth_conf, new.depth_conf),
-        mask=None if old.mask is None and new.mask is None else both(*masks),
-        names=tuple(names[view] for view in order.tolist()),
-        pictures=(),
-        poses=None if old.poses is None or new.poses is None else both(old.poses, new.poses),
-    )
+    views: Tensor
+    own: slice
+
+    @property
+    def inner(self) -> slice:
+        """Positions of ``own`` in ``views``."""
+        first = int(torch.searchsorted(self.views, self.own.start))
+        return slice(first, first + self.own.stop - self.own.start)
 
 
-def without(scene: Scene, names: set[str]) -> Scene:
-    """Returns the scene without the named views; its Gaussians stay.
+def window_size(asked: int | None, views: int, kept: bool = False) -> int:
+    """Returns the number of own views per window; 0: all views at once.
+
+    Args:
+        asked: requested number; None: automatic.
+        views: number of views.
+        kept: always use windows, because their voxels are kept.
 
     Raises:
-        ValueError: if no view is left.
+        ValueError: if ``asked`` is below 4 and not 0.
     """
-    rows = torch.tensor([view for view, name in enumerate(scene.names) if name not in names])
-    if not len(rows):
-        raise ValueError("no image would be left in the scene")
-    return replace(
-        scene,
-        cameras=scene.cameras.select(rows.to(scene.cameras.world_to_camera.device)),
-        images=scene.images[rows],
-        depth=scene.depth[rows],
-        depth_conf=scene.depth_conf[rows],
-        mask=None if scene.mask is None else scene.mask[rows],
-        names=tuple(scene.names[view] for view in rows.tolist()),
-        pictures=(),
-        poses=None if scene.poses is None else scene.poses[rows],
-    )
+    if asked is not None and asked != 0 and asked < 4:
+        raise ValueError(f"window must be at least 4 views, or 0 for all views at once, got {asked}")
+    if kept:
+        return min(asked or SIZE, views)
+    size = asked if asked is not None else SIZE if views > AUTOMATIC else 0
+    return size if 0 < size < views else 0
+
+
+def cut(count: int, size: int) -> list[Window]:
+    """Returns windows of at most ``size`` consecutive own views and their neighbours; each view is owned once."""
+    blocks = -(-count // size)
+    total = min(size + 2 * max(size // 6, MARGIN), count) if blocks > 1 else count
+    windows = []
+    for begin, end in itertools.pairwise(count * block // blocks for block in range(blocks + 1)):
+        first = min(max(begin - (total - (end - begin)) // 2, 0), count - total)
+        windows.append(Window(torch.arange(first, first + total), slice(begin, end)))
+    return windows
+
+
+class Capture:
+    """All views of a long capture.
+
+    Args:
+        store: store of the decoded views.
+        pictures: source pictures, one per view.
+        size: ``(height, width)`` of the images.
+        monitor: shows the progress.
+
+    Attributes:
+        images: ``[V, 3, H, W]``, memory-mapped.
+        mask: ``[V, H, W]``, memory-mapped; None: all pixels count.
+        given: given cameras ``[1, V]``; None if there are none.
+
+    Raises:
+        ValueError: if a picture cannot be read.
+    """
+
+    def __init__(self, store: WindowStore, pictures: Sequence[Picture], size: tuple[int, int], monitor: Monitor):
+        self.pictures, self.store, self.size, count = pictures, store, size, len(pictures)
+        self._source = source_of(pictures)
+        self.images = store.array("images", (count, 3, *size))
+        intrinsics = []
+        with monitor.stage("load images", -(-count // AT_ONCE)) as advance:
+            for first in range(0, count, AT_ONCE):
+                name = f"loaded-{first:06d}"
+                found = store.load(name)
+                if found is None:
+                    found = self._read(slice(first, min(first + AT_ONCE, count)), size)
+                    store.save(name, found)
+                intrinsics.append(found["intrinsics"])
+                advance()
+        self.mask = store.array("mask") if store.has("mask") else None
+        self._depth = store.array("given_depth") if store.has("given_depth") else None
+        self.given: Cameras | None = None
+        if self._source:
+            self.given = Cameras(given_poses(pictures)[None], torch.cat(intrinsics)[None], size)
+
+    def _read(self, rows: slice, size: tuple[int, int]) -> dict[str, Tensor]:
+        views = load_views(self.pictures[rows], size, Monitor())
+        shape = (len(self.pictures), *size)
+        self.images[rows] = views.images
+        if views.mask is not None:
+            self.store.array("mask", shape, fill=1)[rows] = views.mask
+        hints = views.hints
+        if hints.cameras is None:
+            return {"intrinsics": torch.eye(3).repeat(len(views.images), 1, 1)}
+        if hints.depth is not None:
+            self.store.array("given_depth", shape)[rows] = hints.depth[0]
+        return {"intrinsics": hints.cameras.intrinsics[0]}
+
+    def views(self, rows: Tensor) -> tuple[Tensor, Hints]:
+        """Returns images ``[1, n, 3, H, W]`` and hints of the views ``rows [n]``."""
+        mask = None if self.mask is None else self.mask[None, rows]
+        if self.given is None:
+            return self.images[None, rows], Hints(frame_ids=rows[None], mask=mask)
+        depth = None if self._depth is None else self._depth[None, rows]
+        near_far = depth_range([self.pictures[row] for row in rows.tolist()])
+        hints = Hints(depth, self.given.select(rows), (self._source,), rows[None], near_far, mask)
+        return self.images[None, rows], hints
