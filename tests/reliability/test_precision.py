@@ -156,7 +156,7 @@ PLACES = [
     (vg2gt.rendering.scenes, "_scene_views"),
     *((called, "__call__") for called in (Renderer, SceneScale, GeometryLoss, GaussianLoss)),
     (vg2gt.losses.objective.VG2GTLoss, "forward"),
-    *places(vg2gt.losses.objective, "normalize_truth camera_errors"),
+    *places(vg2gt.losses.objective, "normalize_truth"),
 ]
 BASELINE_PLACES = [
     (vg2gt.baselines.pixels, "ray_directions"),

@@ -1,9 +1,9 @@
 """`vg2gt view`: what it writes, and one clear line for everything that is wrong."""
 
-from pathlib import json
+import json
+from pathlib import Path
 
 import numpy as np
-import Path
 import pytest
 from PIL import Image
 
