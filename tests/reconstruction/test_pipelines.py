@@ -67,8 +67,6 @@ def test_cameras_are_found_where_people_have_them(folder: Path, frames, layout: 
             shutil.move(path, images / path.name)
         given = images
     elif layout == "other case":
-        for path in list((folder / "sparse" / "0").iterdir()):
-            path.rename(path.with_name(path.name.capitalize()))
         images.rename(folder / "Images")
     else:
         given = images.rename(folder / "my photographs")
