@@ -6,6 +6,7 @@ cache folder is therefore named by a hash of the versions and of all sources tha
 
 from __future__ import annotations
 
+import atexit
 import gc
 import hashlib
 import logging
@@ -130,6 +131,7 @@ class _Announcement(event.Listener):
         if not self._said:
             log.info("compiling kernels (once per machine and version, about 20 s in all)")
             gc.freeze()  # otherwise garbage collection keeps scanning all of torch during compilation
+            atexit.register(gc.unfreeze)  # otherwise Triton reports leaks at the end
         self._said = True
 
     def on_end(self, event: event.Event) -> None:
