@@ -5,8 +5,9 @@ after an interruption, run the same command again; finished rooms and views are 
 Infinigen and Blender are installed into an environment of their own (``OUT/environment``, or ``--env``).
 
 Results: ``OUT/train/room_NNNN`` and ``OUT/held_out/room_NNNN``, and their paths as scenes in ``OUT/paths``, folders for
-``data=infinigen``. A room that fails leaves ``OUT/work/room_NNNN/failed.txt`` and is skipped from then on. A room that
-does not pass the check goes to ``OUT/rejected``.
+``data=infinigen``; ``OUT/log.csv`` with the time of every stage. A room that fails leaves
+``OUT/work/room_NNNN/failed.txt`` and is skipped from then on. A room that does not pass the check goes to
+``OUT/rejected``.
 """
 
 from __future__ import annotations
@@ -42,11 +43,6 @@ _FASTER = (
 def kind(seed: int) -> str:
     """Returns Infinigen's name of the kind of room for a seed; kinds alternate."""
     return list(KINDS)[seed % len(KINDS)]
-
-
-def part(seed: int) -> str:
-    """Returns the folder name of a room's split."""
-    return "held_out" if seed in HELD_OUT else "train"
 
 
 def make_environment(env: Path, python: str) -> Path:
@@ -132,7 +128,7 @@ class Rooms:
         """Makes one room, unless it exists or failed before."""
         room = f"room_{seed:04d}"
         work = self.out / "work" / room
-        if any((self.out / place / room).exists() for place in (part(seed), "rejected")):
+        if any((self.out / place / room).exists() for place in ("train", "held_out", "rejected")):
             return
         if (work / "failed.txt").exists():
             print(f"{room} failed before ({work / 'failed.txt'}); remove that file to try it again", flush=True)
@@ -166,7 +162,8 @@ class Rooms:
         figures = json.loads((work / "check.json").read_text().splitlines()[-1])
         (views / "check.json").write_text(json.dumps(figures | {"seed": seed, "kind": kind(seed)}) + "\n")
         print(f"{room} ({kind(seed)}): {figures}", flush=True)
-        place = self.out / (part(seed) if figures["ok"] else "rejected")
+        accepted = "held_out" if seed in HELD_OUT else "train"
+        place = self.out / (accepted if figures["ok"] else "rejected")
         place.mkdir(exist_ok=True)
         views.rename(place / room)
         shutil.rmtree(work / "coarse")
@@ -174,13 +171,18 @@ class Rooms:
             link_paths(place / room)
 
     def _stage(self, command: Sequence[object], log: Path) -> None:
-        """Runs a script of this folder in Infinigen's environment."""
+        """Runs a script in Infinigen's environment; adds its wall and core seconds to ``OUT/log.csv``."""
         script, *options = map(str, command)
+        before = os.times()
         with log.open("w") as file:
             subprocess.run(
                 [str(self.interpreter), str(HERE / script), *options], check=True,
                 cwd=self.links, env={**os.environ, **_THREADS}, stdout=file, stderr=subprocess.STDOUT,
             )  # fmt: skip
+        after = os.times()
+        core = after.children_user + after.children_system - before.children_user - before.children_system
+        with (self.out / "log.csv").open("a") as file:
+            file.write(f"{log.parent.name},{script},{after.elapsed - before.elapsed:.0f},{core:.0f}\n")
 
 
 def main() -> None:
