@@ -70,11 +70,17 @@ def test_spz_by_its_published_layout(tmp_path: Path) -> None:
     assert list(data[36:]) == [192, 128, 128, 128, 160, 128, 128, 128, 0]
 
 
-def test_far_positions_are_kept_and_other_files_are_named(tmp_path: Path) -> None:
+def test_version_2_is_read_far_positions_are_kept_and_other_files_are_named(tmp_path: Path) -> None:
     path = tmp_path / "a.spz"
+    body = bytes([0, 16, 0, 0, 240, 255, 0, 0, 0]) + bytes([128, 128, 0, 255, 160, 160, 160]) + bytes([255, 128, 128])
+    path.write_bytes(gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 2, 1, 0, 12, 0, 0) + body))
+    read = read_spz(path)
+    torch.testing.assert_close(read.means, torch.tensor([[1.0, -1.0, 0.0]]))
+    torch.testing.assert_close(read.scales, torch.ones(1, 3))
+    torch.testing.assert_close(read.quats[0].abs(), torch.tensor([0.0, 1, 0, 0]), rtol=0, atol=0.01)
     for content, said in (
-        (b"NGSP" + bytes(40), "version 3.*splat-transform"),
-        (gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 2, 0, 0, 12, 0, 0)), "version 3 .*, got b'NGSP' 2"),
+        (b"NGSP" + bytes(40), "version 2 or 3.*splat-transform"),
+        (gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 1, 0, 0, 12, 0, 0)), "version 2 or 3 .*, got b'NGSP' 1"),
         (gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, 5, 0, 12, 0, 0)), "5 Gaussians need 100 bytes, found 0"),
         (gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, 0, 4, 12, 0, 0)), "degree 4"),
     ):

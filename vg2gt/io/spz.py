@@ -1,9 +1,9 @@
 """``.spz``, Niantic's compressed Gaussians: a gzip stream of columns, about a tenth of the size of a PLY.
 
 A header of 16 bytes (magic, version, number of Gaussians, degree, fractional bits, flags), then all positions (24-bit
-fixed point), opacities, colours, log-scales (a byte each), rotations (the smallest three of x y z w in 32 bits) and
-higher spherical harmonics (a byte each). Axes are those of the PLY, as Niantic's converter and SuperSplat write them;
-the format defines none. Format: https://github.com/nianticlabs/spz
+fixed point), opacities, colours, log-scales (a byte each), rotations (version 3: the smallest three of x y z w in 32
+bits; version 2: x y z in a byte each) and higher spherical harmonics (a byte each). Axes are those of the PLY, as
+Niantic's converter and SuperSplat write them; the format defines none. Format: https://github.com/nianticlabs/spz
 
 Losses compared with a PLY file: positions are rounded to 2^-21 of the scene's extent or 2^-20 units, scales to 3.2 %
 and clipped to [4.5e-5, 380], opacities to 1/510, colours to 1/270 and clipped to [-0.44, 1.44], rotations to 1/700,
@@ -60,7 +60,7 @@ def write_spz(path: str | Path, gaussians: Gaussians) -> Path:
 
 
 def read_spz(path: str | Path) -> Gaussians:
-    """Reads a ``.spz`` file of version 3.
+    """Reads a ``.spz`` file of version 2 or 3.
 
     Returns:
         The Gaussians as scene 0, float32.
@@ -70,14 +70,15 @@ def read_spz(path: str | Path) -> Gaussians:
     """
     path = Path(path)
     content = regular(path).read_bytes()
-    expected = f"{path}: expected a .spz of version 3 (splat-transform --spz-version 3 converts others)"
+    expected = f"{path}: expected a .spz of version 2 or 3 (splat-transform --spz-version 3 converts others)"
     try:
         with gzip.open(io.BytesIO(content)) as file:
             magic, version, count, degree, bits, _, _ = _HEADER.unpack(file.read(_HEADER.size))
-            if magic != _MAGIC or version != 3 or degree > 3 or bits > 23:
+            if magic != _MAGIC or version not in (2, 3) or degree > 3 or bits > 23:
                 raise FormatError(f"{expected}, got {magic!r} {version}, degree {degree}, {bits} fractional bits")
-            sides = (9, 1, 3, 3, 4, 3 * ((degree + 1) ** 2 - 1))
-            data = file.read(count * sum(sides) + 1)
+            sides = (9, 1, 3, 3, 4 if version == 3 else 3, 3 * ((degree + 1) ** 2 - 1))
+            # a damaged count must not allocate more than a gzip stream of this length can hold
+            data = file.read(min(count * sum(sides), 1100 * len(content)) + 1)
     except (OSError, EOFError, zlib.error, struct.error) as error:
         raise FormatError(f"{expected}; not one, or damaged: {error}") from error
     if len(data) != count * sum(sides):
@@ -116,7 +117,10 @@ def _packed(quats: NDArray[np.floating]) -> NDArray[np.uint32]:
 
 
 def _unpacked(packed: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Decodes the result of :func:`_packed` to unit quaternions ``[N, 4]`` xyzw."""
+    """Decodes the bytes of version 2 or 3 to unit quaternions ``[N, 4]`` xyzw."""
+    if packed.shape[1] == 3:
+        axis = packed / 127.5 - 1
+        return np.concatenate((axis, np.sqrt(np.maximum(1 - (axis**2).sum(1, keepdims=True), 0))), 1)
     word = np.ascontiguousarray(packed).view("<u4")
     parts = word >> np.array([20, 10, 0], "<u4") & 1023
     others = np.where(parts >> 9, -1, 1) * (parts & 511) / (511 * np.sqrt(2))
