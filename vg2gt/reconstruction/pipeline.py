@@ -7,9 +7,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from vg2gt.geometry.precision import half_precision_on_gpu
@@ -19,10 +21,10 @@ from vg2gt.method.additions.far_shell import far_shell
 from vg2gt.model import VG2GT, Reconstructor
 from vg2gt.reconstruction.cameras import Poses, pictures_for
 from vg2gt.reconstruction.frame import first_frame, similarity_of
-from vg2gt.reconstruction.inputs import as_given, in_order, load_views, source_of, working_order, working_size
+from vg2gt.reconstruction.inputs import Views, as_given, in_order, load_views, source_of, working_order, working_size
 from vg2gt.reconstruction.monitor import Monitor
 from vg2gt.reconstruction.output_names import WINDOWS
-from vg2gt.reconstruction.pictures import SFM_SOURCE, ImagesLike, spread
+from vg2gt.reconstruction.pictures import SFM_SOURCE, ImagesLike, Picture, spread
 from vg2gt.reconstruction.saved import read_scene
 from vg2gt.reconstruction.scene import Scene
 from vg2gt.reconstruction.trust import pixel_trust
@@ -30,7 +32,7 @@ from vg2gt.reconstruction.windows.run import WindowRun, device_of, gaussians_of,
 from vg2gt.reconstruction.windows.store import AUTOMATIC, Anchor, finished_sets, key_of, read_anchor, window_size
 from vg2gt.rendering import Renderer
 from vg2gt.runs.load import load_model
-from vg2gt.types import Cameras
+from vg2gt.types import Cameras, Gaussians, Geometry
 from vg2gt.uncertainty import Calibration
 
 
@@ -97,59 +99,83 @@ def reconstruct_with(
         OutOfMemory: if the device's memory is full.
     """
     monitor = monitor or Monitor()
-    device = device_of(model)
     chosen = pictures_for(model, images, poses, max_images=max_images, sfm_folder=sfm_folder, monitor=monitor)
     with memory_advice(RECONSTRUCTION), chosen as pictures:
         sizes = [picture.size for picture in pictures]
-        target = anchor.size if anchor else working_size(sizes, model.backend.patch_size, device.type, size)
+        target = anchor.size if anchor else working_size(sizes, model.backend.patch_size, device_of(model).type, size)
         note_sizes({f"images of {target[0]}x{target[1]}": len(pictures)})
-        size_of_windows = window_size(window, len(pictures), keep_windows or anchor is not None)
-        to_source, error, support = None, None, None
-        if size_of_windows:
+        if images_at_a_time := window_size(window, len(pictures), keep_windows or anchor is not None):
             # memory-mapped files stay readable after their removal
             with TemporaryDirectory(prefix="vg2gt-windows-", ignore_cleanup_errors=True) as temporary:
                 place = Path(window_folder or temporary)
-                run = WindowRun(window_model(model.eval()), pictures, target, size_of_windows, place, monitor, anchor)
-                geometry, gaussians, unit = run.geometry_and_gaussians()
-                images, mask = run.capture.images, run.capture.mask
-                to_source = run.anchor.to_source if run.anchor and source_of(pictures) else None
+                windows = WindowRun(
+                    window_model(model.eval()), pictures, target, images_at_a_time, place, monitor, anchor
+                )
+                parts = _in_windows(windows, pictures)
         else:
-            views = load_views(pictures, target, monitor)
-            images, mask = views.images, views.mask
-            order = working_order(views.images)
-            ordered, hints = in_order(views, order)
-            ordered, hints = ordered[None].to(device), hints.to(device)
-            with monitor.stage("reconstruct"), monitor.watching(), half_precision_on_gpu(ordered):
-                prediction = model.eval()(ordered, hints)
-            geometry, gaussians = as_given(prediction.surface.detach(), order), prediction.gaussians
-            unit = prediction.unit
-            error, support = pixel_trust(prediction, order, mask, calibration)
+            parts = _at_once(model.eval(), load_views(pictures, target, monitor), monitor, calibration)
+    scene = _scene(parts, pictures, renderer or Renderer(), model.backend.is_metric)
+    scene = scene if model.visibility is None or anchor else with_far_shell(scene)
+    return scene.placed()
+
+
+class _Parts(NamedTuple):
+    """What a reconstruction computes; ``error``, ``support`` and ``to_source`` as in :class:`Scene`."""
+
+    geometry: Geometry
+    gaussians: Gaussians
+    unit: Tensor
+    images: Tensor
+    mask: Tensor | None
+    error: Tensor | None = None
+    support: Tensor | None = None
+    to_source: NDArray[np.float64] | None = None
+
+
+def _in_windows(run: WindowRun, pictures: Sequence[Picture]) -> _Parts:
+    geometry, gaussians, unit = run.geometry_and_gaussians()
+    to_source = run.anchor.to_source if run.anchor and source_of(pictures) else None
+    return _Parts(geometry, gaussians, unit, run.capture.images, run.capture.mask, to_source=to_source)
+
+
+def _at_once(model: Reconstructor, views: Views, monitor: Monitor, calibration: Calibration | None) -> _Parts:
+    order, device = working_order(views.images), device_of(model)
+    ordered, hints = in_order(views, order)
+    ordered, hints = ordered[None].to(device), hints.to(device)
+    with monitor.stage("reconstruct"), monitor.watching(), half_precision_on_gpu(ordered):
+        prediction = model(ordered, hints)
+    geometry = as_given(prediction.surface.detach(), order)
+    error, support = pixel_trust(prediction, order, views.mask, calibration)
+    return _Parts(geometry, prediction.gaussians, prediction.unit, views.images, views.mask, error, support)
+
+
+def _scene(parts: _Parts, pictures: Sequence[Picture], renderer: Renderer, is_metric: bool) -> Scene:
+    """Returns the scene in the cameras' frame, with the transformation to the frame of given cameras, or upright."""
+    geometry, gaussians = parts.geometry, parts.gaussians
     if not len(gaussians):
         raise ValueError("the backend found no depth in any image, so there is nothing to reconstruct")
     source = pictures[0].source
     known = [picture.pose for picture in pictures if picture.pose is not None]
     given = np.stack(known) if source and len(known) == len(pictures) else None
     target = "given" if source and not source.startswith(SFM_SOURCE) else "upright"
-    frame = first_frame(geometry.cameras, float(unit), given, target)
+    frame = first_frame(geometry.cameras, float(parts.unit), given, target)
     metres = frame.scale if pictures[0].is_metric else None
-    scene = Scene(
+    return Scene(
         gaussians=gaussians.detach(),
         cameras=geometry.cameras,
-        images=images,
+        images=parts.images,
         depth=geometry.depth[0].cpu(),
         depth_conf=geometry.depth_conf[0].cpu(),
         names=tuple(picture.name for picture in pictures),
-        renderer=renderer or Renderer(),
-        metres_per_unit=float(geometry.scale) if model.backend.is_metric else metres,
+        renderer=renderer,
+        metres_per_unit=float(geometry.scale) if is_metric else metres,
         cameras_from=source,
-        frame=frame if to_source is None else replace(frame, to_source=to_source),  # the same for all image sets
-        mask=mask,
+        frame=frame if parts.to_source is None else replace(frame, to_source=parts.to_source),  # same for all sets
+        mask=parts.mask,
         pictures=tuple(pictures),
-        error=error,
-        support=support,
+        error=parts.error,
+        support=parts.support,
     )
-    scene = scene if model.visibility is None or anchor else with_far_shell(scene)
-    return scene.placed()
 
 
 def with_far_shell(scene: Scene) -> Scene:
