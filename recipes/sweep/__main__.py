@@ -139,7 +139,7 @@ def main(config: DictConfig) -> None:
         accelerator=config.accelerator,
         devices=config.processes,
         strategy="auto" if config.processes == 1 else DDPStrategy(gradient_as_bucket_view=True),
-        precision="bf16-mixed",
+        precision=config.precision,
         max_steps=config.training.steps,
         callbacks=[keep, RichProgressBar()],
         logger=CSVLogger(out, name="", version=""),

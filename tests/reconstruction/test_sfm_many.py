@@ -104,3 +104,11 @@ def test_parts_share_no_image() -> None:
     ]
     found = sfm._parts(models)  # pyright: ignore[reportArgumentType]
     assert found == [{"a", "b", "c"}, {"d", "x", "y"}, {"z"}, set()]
+
+
+def test_small_images_are_doubled_before_features_are_searched():
+    small, large = 1199, 4000
+    assert sfm.feature_settings([large] * 24) == (1600, 4096, 0)
+    assert sfm.feature_settings([large] * 23 + [small]) == (1280, 4096, -1)
+    assert sfm.feature_settings([large] * 300) == (1600, 2048, 0)
+    assert sfm.feature_settings([small] * 300) == (1024, 2048, -1)

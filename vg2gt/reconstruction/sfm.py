@@ -47,7 +47,8 @@ log = logging.getLogger(__name__)
 FORMAT = 1
 """Version of the folder's format; increment it when the format changes."""
 IMAGE_SIDE = 1600  # maximum longer side of the kept images, in pixels
-FEATURE_SIDE, FEATURES = 1280, 4096  # longer side of the images for feature extraction, maximum number of features
+LARGE_SIDE = 1200  # features of images from this longer side on are searched without doubling the images first
+FEATURE_SIDE, FEATURES = 1280, 4096  # longer side of doubled images before doubling, maximum number of features
 MANY_SIDE, MANY_FEATURES = 1024, 2048  # the same for more than ALL_PAIRS photographs
 ALL_PAIRS = 60  # number of photographs up to which all pairs are matched
 DISTANCES = (1, 2, 4, 8, 16)  # to the paired photographs in the given order
@@ -128,7 +129,8 @@ def find_cameras(pictures: Sequence[Picture], folder: Path, monitor: Monitor) ->
 
 def _key(pictures: Sequence[Picture]) -> str:
     """Returns a hash of the pictures' contents, masks, names and order, and of the processing settings."""
-    settings = [FORMAT, IMAGE_SIDE, *_feature_settings(len(pictures)), SEED, _MODEL, _QUALITY]
+    features = feature_settings([max(picture.size) for picture in pictures])
+    settings = [FORMAT, IMAGE_SIDE, *features, SEED, _MODEL, _QUALITY]
     contents = []
     for picture in pictures:
         mask = None if picture.path is None else mask_file(picture.path)
@@ -209,9 +211,18 @@ def _stage(pictures: Sequence[Picture], work: Path, advance: Any) -> dict[tuple[
     return lenses
 
 
-def _feature_settings(count: int) -> tuple[int, int]:
-    """Returns the longer side of the images for feature extraction, and the maximum number of features."""
-    return (FEATURE_SIDE, FEATURES) if count <= ALL_PAIRS else (MANY_SIDE, MANY_FEATURES)
+def feature_settings(sides: Sequence[int]) -> tuple[int, int, int]:
+    """Chooses the longer side of the images for feature extraction, the maximum number of features, and SIFT's octave.
+
+    Args:
+        sides: longer side of every image in pixels.
+
+    Returns:
+        Side, number, and first octave: -1 doubles images first, which small ones need to have enough features; 0 takes
+        large ones as they are, in a third of the time.
+    """
+    side, features = (FEATURE_SIDE, FEATURES) if len(sides) <= ALL_PAIRS else (MANY_SIDE, MANY_FEATURES)
+    return (IMAGE_SIDE, features, 0) if min(sides) >= LARGE_SIDE else (side, features, -1)
 
 
 def _find_features(
@@ -232,7 +243,9 @@ def _find_features(
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False
     options.num_threads = _threads()
-    options.max_image_size, options.sift.max_num_features = _feature_settings(len(names))
+    sides = [max(height, width) for (height, width, _), members in lenses.items() for _ in members]
+    settings = feature_settings(sides)
+    options.max_image_size, options.sift.max_num_features, options.sift.first_octave = settings
     masked = pycolmap.ImageReaderOptions()
     if (work / _MASKS).exists():
         masked.mask_path = work / _MASKS
