@@ -176,7 +176,7 @@ class RefineOptions:
         merge_cells: merge Gaussians at the start if at least two, but fewer than ``min_views``, views agree with them,
             in cells this many times as wide as what the median Gaussian covers. 0: remove them.
         geometry_every: render depth and normals in every N-th step only, where the terms that need them count N times;
-            rendering colour alone is faster.
+            rendering colour alone is twice as fast. If N > 1, states are compared by colour alone.
         seed: random seed of the view order.
         rates: learning rates.
         loss: loss to minimise.

@@ -111,6 +111,8 @@ class _Refinement:
         self.order = ViewOrder(len(seen.images), options.holdout, options.seed)
         self.trained = self.order.trained.to(seen.images.device)
         self.options = options.of(len(self.order.trained))
+        loss = self.options.loss
+        self.scoring = loss if self.options.geometry_every == 1 else loss.with_geometry(0)  # renders twice as fast
         start = gaussians
         if options.min_views:
             start = supported(gaussians, cameras, seen.depth, options.min_views, options.merge_cells)
@@ -207,7 +209,7 @@ class _Refinement:
     @torch.no_grad()
     def _score(self, scene: RefinedScene, views: Tensor) -> tuple[Tensor, Tensor]:
         """Returns loss and PSNR ``[R]`` of views, each rendered on its own."""
-        found = [self._loss(scene, view, self.options.loss) for view in views.to(self.seen.images.device).split(1)]
+        found = [self._loss(scene, view, self.scoring) for view in views.to(self.seen.images.device).split(1)]
         return torch.stack([loss for loss, _ in found]).cpu(), torch.cat([image for _, image in found]).cpu()
 
     def _check(self) -> str:
