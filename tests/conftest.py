@@ -27,6 +27,15 @@ SHARED = Path(__file__).resolve().parents[2] / "shared"
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 
 
+# Their commands run in processes that one server has imported all for; one process of pytest gets the first tests.
+WARM = ("reliability", "studies", "test_log.py", "test_architecture.py", "test_plugins.py")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Lets one server of warm processes do, whose start takes ten seconds."""
+    items.sort(key=lambda item: not {item.path.name, item.path.parent.name} & set(WARM))
+
+
 def pytest_collection_finish() -> None:
     """Leaves what was imported out of full collections."""
     gc.collect()
