@@ -27,13 +27,23 @@ SHARED = Path(__file__).resolve().parents[2] / "shared"
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 
 
-# Their commands run in processes that one server has imported all for; one process of pytest gets the first tests.
-WARM = ("reliability", "studies", "test_log.py", "test_architecture.py", "test_plugins.py")
+# Their commands run in processes that one server, whose start takes ten seconds, has imported all for.
+WARM = {"reliability", "studies", "test_log.py", "test_architecture.py", "test_plugins.py"}
 
 
+@pytest.hookimpl(trylast=True)  # after others are deselected
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Lets one server of warm processes do, whose start takes ten seconds."""
-    items.sort(key=lambda item: not {item.path.name, item.path.parent.name} & set(WARM))
+    """Of two processes of pytest, one begins with the first test and starts that server, one in the middle.
+
+    The renderer's tests are there, those in the interpreter first: when they need a kernel that trainings need too, the
+    other process has compiled it.
+    """
+    first = [item for item in items if WARM & {item.path.name, item.path.parent.name}]
+    middle = [item for item in items if item.path.parent.name == "rendering"]
+    middle.sort(key=lambda item: item.path.name != "test_triton.py")
+    others = [item for item in items if item not in {*first, *middle}]
+    before = max(len(items) // 2 - len(first), 0)
+    items[:] = [*first, *others[:before], *middle, *others[before:]]
 
 
 def pytest_collection_finish() -> None:
