@@ -8,11 +8,13 @@ import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported: there is a test process a core
 
+import copy
 import gc
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 
@@ -60,6 +62,28 @@ def pytest_unconfigure() -> None:
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int | None:
     """One process for the tests of a GPU, which others would take the memory of; otherwise one a core."""
     return 0 if config.option.markexpr == "gpu" else None
+
+
+@pytest.fixture(scope="session", autouse=True)
+def configurations_are_parsed_once() -> Iterator[None]:
+    """Most tests compose a configuration; a third of that is to parse the same files."""
+    from omegaconf import OmegaConf
+
+    load, kept = OmegaConf.load, {}
+
+    def once(file: Any) -> Any:
+        path = getattr(file, "name", None) if hasattr(file, "read") else file
+        if not isinstance(path, str | Path):
+            return load(file)
+        about = os.stat(path)
+        key = (str(path), about.st_mtime_ns, about.st_size)
+        if key not in kept:
+            kept[key] = load(file)
+        return copy.deepcopy(kept[key])
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(OmegaConf, "load", staticmethod(once))
+        yield
 
 
 @pytest.fixture(scope="session")
