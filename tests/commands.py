@@ -40,6 +40,15 @@ def become(folder: Path | str, outputs: Sequence[Path | str], environment: dict[
             os.environ[name] = value
 
 
+FRESH = """
+import sys
+for name in list(sys.modules):
+    if name.split(".")[0] in ("vg2gt", "backends"):
+        del sys.modules[name]
+"""
+"""For :func:`run_python`: what follows imports this project anew, and only what it needs of it."""
+
+
 def _execute(code: str, arguments: list[str], *where: Any) -> None:
     become(*where)
     sys.argv = ["vg2gt", *arguments]

@@ -8,11 +8,13 @@ import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported: there is a test process a core
 
+import copy
 import gc
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 
@@ -25,6 +27,25 @@ SHALLOW = ["+backend=da3_tiny", "backend.depth=4", "backend.multiview_from=1", "
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
+
+
+# Their commands run in processes that one server, whose start takes ten seconds, has imported all for.
+WARM = {"reliability", "studies", "test_log.py", "test_architecture.py", "test_plugins.py"}
+
+
+@pytest.hookimpl(trylast=True)  # after others are deselected
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Of two processes of pytest, one begins with the first test and starts that server, one in the middle.
+
+    The renderer's tests are there, those in the interpreter first: when they need a kernel that trainings need too, the
+    other process has compiled it.
+    """
+    first = [item for item in items if WARM & {item.path.name, item.path.parent.name}]
+    middle = [item for item in items if item.path.parent.name == "rendering"]
+    middle.sort(key=lambda item: item.path.name != "test_triton.py")
+    others = [item for item in items if item not in {*first, *middle}]
+    before = max(len(items) // 2 - len(first), 0)
+    items[:] = [*first, *others[:before], *middle, *others[before:]]
 
 
 def pytest_collection_finish() -> None:
@@ -41,6 +62,28 @@ def pytest_unconfigure() -> None:
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int | None:
     """One process for the tests of a GPU, which others would take the memory of; otherwise one a core."""
     return 0 if config.option.markexpr == "gpu" else None
+
+
+@pytest.fixture(scope="session", autouse=True)
+def configurations_are_parsed_once() -> Iterator[None]:
+    """Most tests compose a configuration; a third of that is to parse the same files."""
+    from omegaconf import OmegaConf
+
+    load, kept = OmegaConf.load, {}
+
+    def once(file: Any) -> Any:
+        path = getattr(file, "name", None) if hasattr(file, "read") else file
+        if not isinstance(path, str | Path):
+            return load(file)
+        about = os.stat(path)
+        key = (str(path), about.st_mtime_ns, about.st_size)
+        if key not in kept:
+            kept[key] = load(file)
+        return copy.deepcopy(kept[key])
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(OmegaConf, "load", staticmethod(once))
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -122,9 +122,15 @@ def composes(config: str, words: list[str], line: str) -> None:
     overrides = [word for word in words if "=" in word and not word.startswith("-")]
     path = [f"hydra.searchpath=[{ROOT / folder}]" for folder in folders]
     try:
-        compose(config, "++output_dir=unused", *path, *overrides)
+        composed_once(config, *path, *overrides)
     except Exception as error:
         raise AssertionError(f"{line}: {error}") from error
+
+
+@cache
+def composed_once(config: str, *overrides: str) -> None:
+    """Composes what several lines say once."""
+    compose(config, "++output_dir=unused", *overrides)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=named)

@@ -1,17 +1,17 @@
 """A package of its own adds a backend and a data set by entry points (examples/plugin)."""
 
-import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from tests.commands import ROOT
+from tests.commands import FRESH, ROOT, run_python
 from vg2gt.runs.trust import UntrustedError, check_targets
 
 CODE = """
-import sys, torch
+sys.path.insert(0, sys.argv.pop(1))
+import torch
 from pathlib import Path
 from tests.data.sources.layout_rgbd import write_recording
 from tests.data.sources.layouts import room
@@ -29,6 +29,7 @@ batch = next(iter(run.datamodule.train_dataloader()))
 depth, truth = batch.depth[batch.depth > 0], shown.depth[shown.depth > 0]
 assert 5 < depth.median() / truth.median() < 20, (depth.median(), truth.median())
 vg2gt.cli.main()
+print("again", load_model("outputs/plugin", device="cpu").model.backend.name)
 """
 
 
@@ -45,25 +46,14 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_package_adds_a_backend_and_a_data_set(site: Path, tmp_path: Path) -> None:
     """Trains a step with both, and its run is loaded again without a word of trust."""
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(site), str(ROOT)))}
     small = ["data.image_size=[28,56]", "data.min_views=2", "data.max_views=2", "data.max_images=2"]
     small += ["data.target_views=1", "data.eval_context=2", "data.eval_target=1", "data.index_cache=null"]
     small += ["trainer.max_steps=1", "trainer.accelerator=cpu", "name=plugin"]
     options = [f"data.root={tmp_path / 'data'}", *small]
-    done = subprocess.run(
-        [sys.executable, "-c", CODE, str(tmp_path), "train", "backend=bright", "data=centimetres", *options],
-        cwd=tmp_path,
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    arguments = [str(site), str(tmp_path), "train", "backend=bright", "data=centimetres", *options]
+    done = run_python(FRESH + CODE, *arguments, folder=tmp_path)
     assert done.returncode == 0, done.stdout[-1500:] + done.stderr[-3000:]
-    again = "from vg2gt import load_model; print(load_model('outputs/plugin', device='cpu').model.backend.name)"
-    done = subprocess.run(
-        [sys.executable, "-c", again], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
-    )
-    assert done.stdout.strip().endswith("bright"), done.stderr[-2000:]
+    assert done.stdout.strip().endswith("again bright"), done.stdout[-1500:]
 
 
 def test_what_a_package_declares_is_trusted_and_nothing_else_of_it(monkeypatch: pytest.MonkeyPatch) -> None:

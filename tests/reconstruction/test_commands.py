@@ -20,7 +20,10 @@ from vg2gt.reconstruction.scene import Scene
 TINY = ["backend=da3_tiny", "--size", "70", "--quiet", "--device", "cpu"]
 
 
-def test_photographs_of_all_sizes(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_photographs_of_all_sizes(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch) -> None:
+    """Refined by default; 20 of the 400 steps do here."""
+    by_default = reconstruct_command._refinement
+    monkeypatch.setattr(reconstruct_command, "_refinement", lambda *given: replace(by_default(*given), steps=20))
     reconstruct_command.main([str(photos), "--out", str(tmp_path / "out"), *TINY])
     names = {"scene.ply", "cameras.json", "views.npz", "report.png", "report.json"}
     assert {p.name for p in (tmp_path / "out").iterdir()} == names
@@ -34,6 +37,7 @@ def test_photographs_of_all_sizes(photos: Path, tmp_path: Path, capsys: pytest.C
     assert "untrained" in printed
     assert "refining for 400 steps" in printed
     assert "peak memory" in printed
+    assert figures["refinement"]["steps"] == 20
 
 
 def test_written_scene_renders_to_the_image_in_memory(scene: Scene, tmp_path: Path) -> None:

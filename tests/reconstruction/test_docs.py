@@ -60,7 +60,8 @@ def test_the_page_on_refinement(workplace: Path, monkeypatch, capsys: pytest.Cap
     commands = _commands("docs/guides/refine.md", "reconstruct", "refine")
     assert {words[1] for words in commands} == {"reconstruct", "refine"}
     for words in commands:
-        short = ["2" if before == "--seconds" else word for before, word in zip(["", *words], words, strict=False)]
+        less = {"--seconds": "0.5", "--refine": "6"}
+        short = [less.get(before, word) for before, word in zip(["", *words], words, strict=False)]
         _run([*short, "--quiet", "--device", "cpu"], monkeypatch)
     for scene in ("start/refined", "sharp"):
         assert "refinement" in (workplace / "outputs" / scene / "report.json").read_text()

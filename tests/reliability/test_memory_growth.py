@@ -1,4 +1,4 @@
-"""Training keeps nothing of its steps: as many live tensors after a step as twenty steps before."""
+"""Training keeps nothing of its steps: as many live tensors after a step as eight steps before."""
 
 import gc
 from pathlib import Path
@@ -30,9 +30,9 @@ class CountTensors(lightning.Callback):
 
 
 def test_steps_leave_no_tensors_behind(tmp_path: Path, cache: Path) -> None:
-    counts = CountTensors((6, 26))
+    counts = CountTensors((6, 14))
     size = ["data.image_size=[28,56]", "data.min_views=3", "data.max_views=3", "data.max_images=3"]
-    run = build(small_config(tmp_path, cache, *size, "trainer.max_steps=26"))
+    run = build(small_config(tmp_path, cache, *size, "trainer.max_steps=14"))
     run.trainer.callbacks.append(counts)  # pyright: ignore[reportAttributeAccessIssue]
     run.trainer.fit(run.module, datamodule=run.datamodule)
     (before, bytes_before), (after, bytes_after) = counts.found.values()

@@ -71,7 +71,7 @@ def test_equals_the_reference(kind: tuple[Mode, DepthKind], degree: int, scenes:
 
 @runnable
 def test_color_only_and_rays_with_many_hits() -> None:
-    gaussians, cameras = soup(60, size=0.6), pinhole((3, 4))
+    gaussians, cameras = soup(36, size=0.6), pinhole((3, 4))
     gaussians = replace(gaussians, opacities=gaussians.opacities * 0.2)
     expected = render_with_gradients(gaussians, cameras, implementation="dense", bisections=40)
     out, grads = render_with_gradients(gaussians, cameras, DEVICE, implementation="triton", bisections=40)
@@ -86,10 +86,10 @@ def test_color_only_and_rays_with_many_hits() -> None:
 
 
 @runnable
-@pytest.mark.parametrize("options", [{"near": 2.6}, {"newton_steps": 0}])
-def test_the_search_for_the_median_equals_the_reference(options: dict[str, float]) -> None:
+@pytest.mark.parametrize(("options", "count", "size"), [({"near": 2.6}, 20, 0.3), ({"newton_steps": 0}, 10, 0.4)])
+def test_the_search_for_the_median_equals_the_reference(options: dict[str, float], count: int, size: float) -> None:
     """Where Gaussians reach through the near plane, and by bisections alone."""
-    gaussians, cameras = soup(20, seed=3, size=0.3), pinhole((5, 6))
+    gaussians, cameras = soup(count, seed=3, size=size), pinhole((5, 6))
     expected, found = (
         render_with_gradients(gaussians, cameras, device, implementation=name, bisections=45, **options)
         for name, device in (("dense", "cpu"), ("triton", DEVICE))
@@ -108,7 +108,7 @@ def test_the_search_for_the_median_equals_the_reference(options: dict[str, float
 )
 def test_the_search_crosses_gaps(dtype: torch.dtype, tolerance: float) -> None:
     """Translucent Gaussians, and others forty times as far: between them nothing tells where the median is."""
-    near, cameras = soup(40, seed=5, size=0.4), pinhole((5, 6))
+    near, cameras = soup(12, seed=5, size=0.5), pinhole((5, 6))
     far = replace(near, means=40 * near.means, scales=near.scales * torch.tensor([40.0, 40.0, 1.0]))
     both = replace(near, **{name: torch.cat((getattr(near, name), getattr(far, name))) for name in FIELDS})
     both = replace(both, opacities=0.3 * both.opacities)
@@ -116,7 +116,7 @@ def test_the_search_crosses_gaps(dtype: torch.dtype, tolerance: float) -> None:
     on_device = floats_to(both, dtype).to(DEVICE), floats_to(cameras, dtype).to(DEVICE)
     found = render(*on_device, implementation="triton").depth.cpu()
     there = exact > 0
-    assert there.float().mean() > 0.3
+    assert (exact > 20).double().mean() > 0.3
     assert torch.equal(found > 0, there)
     assert ((found - exact).abs() / exact)[there].max() < tolerance
 
