@@ -27,7 +27,6 @@ _CUT_SHARE = 0.25  # of samples whose planes do not cover the whole depth of the
 # Range of the depth quantile at which they end; higher indoors, where walls are near.
 _CUT, _CUT_INDOORS = (0.5, 0.98), (0.85, 0.98)
 _LEAST_OVERLAP = 0.15
-_ANY_SHARE = 0.2  # of samples whose views are drawn whether they overlap or not, as some views of any capture do not
 _WALK_FRAMES, _WALK_STEP = 14, math.radians(9)  # maximum frames and median rotation between frames of a walk
 _PLANES = (32, 48)  # few sizes, as convolutions on CPUs are compiled for each
 _SOURCES, _SOURCE_SHARES = (2, 3), (0.7, 0.3)
@@ -162,8 +161,6 @@ def _overlapping(scene: SceneFrames, count: int, rng: Generator) -> NDArray[np.i
     overlap = (inside & (z < 1.05 * there)).float().mean(1).numpy() if len(points) else np.ones(len(u))
     overlap[first] = 0
     likely = np.maximum(overlap, 1e-3) ** rng.uniform(0, 2) * np.where(overlap > _LEAST_OVERLAP, 1.0, 1e-4)
-    if rng.random() < _ANY_SHARE:
-        likely = np.ones(len(likely))
     likely[first] = 0
     return np.append(first, rng.choice(len(likely), count - 1, replace=False, p=likely / likely.sum()))
 
