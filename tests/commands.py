@@ -46,7 +46,7 @@ for name in list(sys.modules):
     if name.split(".")[0] in ("vg2gt", "backends"):
         del sys.modules[name]
 """
-"""For :func:`run_python`: what follows imports this project anew, and only what it needs of it."""
+"""Prefix of code for :func:`run_python` that must import this project itself."""
 
 
 def _execute(code: str, arguments: list[str], *where: Any) -> None:

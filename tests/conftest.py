@@ -29,16 +29,15 @@ SHARED = Path(__file__).resolve().parents[2] / "shared"
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 
 
-# Their commands run in processes that one server, whose start takes ten seconds, has imported all for.
+# Tests that run commands in forks of a server process. It has imported everything, which takes ten seconds.
 WARM = {"reliability", "studies", "test_log.py", "test_architecture.py", "test_plugins.py"}
 
 
 @pytest.hookimpl(trylast=True)  # after others are deselected
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Of two processes of pytest, one begins with the first test and starts that server, one in the middle.
+    """Puts tests of commands first and tests of the renderer in the middle, where the second worker starts.
 
-    The renderer's tests are there, those in the interpreter first: when they need a kernel that trainings need too, the
-    other process has compiled it.
+    Only the first worker then starts the server, and the two workers do not compile the same kernels at the same time.
     """
     first = [item for item in items if WARM & {item.path.name, item.path.parent.name}]
     middle = [item for item in items if item.path.parent.name == "rendering"]

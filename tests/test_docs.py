@@ -129,7 +129,7 @@ def composes(config: str, words: list[str], line: str) -> None:
 
 @cache
 def composed_once(config: str, *overrides: str) -> None:
-    """Composes what several lines say once."""
+    """Composes a configuration; commands that occur on several pages are composed once."""
     compose(config, "++output_dir=unused", *overrides)
 
 

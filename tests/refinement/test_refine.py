@@ -209,6 +209,8 @@ def test_options_out_of_range(start: Start) -> None:
         run(replace(start, gaussians=start.gaussians.map(lambda tensor: tensor[:0])), RefineOptions())
     with pytest.raises(ValueError, match=r"refine.steps must be at least 1, or null"):
         RefineOptions(steps=0)
+    with pytest.raises(ValueError, match=r"refine.geometry_every must be 1 without a colour term.*, got 4"):
+        RefineOptions(geometry_every=4, loss=RefineLoss(color_l1=0.0, ssim=0.0))
     with pytest.raises(ValueError, match=r"refine.fill must be at least 0, got -1"):
         RefineOptions(fill=-1)
     with pytest.raises(ValueError, match=r"refine.rates.sh"):

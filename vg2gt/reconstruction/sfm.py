@@ -85,7 +85,7 @@ def find_cameras(pictures: Sequence[Picture], folder: Path, monitor: Monitor) ->
     """Returns the pictures for which structure from motion finds a camera: undistorted, with sparse point depths.
 
     Pictures with the same size and EXIF focal length share one lens. The world frame is COLMAP's, scaled so that the
-    median depth of the points over all views is 1. The same pictures give the same cameras.
+    median depth of the points over all views is 1. Random seeds are fixed.
 
     Args:
         pictures: in order; their cameras, if any, are ignored.

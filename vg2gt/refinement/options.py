@@ -209,6 +209,11 @@ class RefineOptions:
             ("min_views", self.min_views >= 0, "at least 0"),
             ("merge_cells", self.merge_cells >= 0, "at least 0"),
             ("geometry_every", self.geometry_every >= 1, "at least 1"),
+            (
+                "geometry_every",
+                self.geometry_every <= 1 or self.loss.color_l1 + self.loss.ssim > 0,
+                "1 without a colour term, as colour compares the states",
+            ),
         ):
             if not good:
                 raise ValueError(f"refine.{name} must be {expected}, got {getattr(self, name)}")
