@@ -118,7 +118,22 @@ def shallow_da3():
 
 @pytest.fixture(scope="session")
 def onnx_bundle(shallow_da3, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An exported network."""
-    from backends.onnx import export
+    """An exported network without ``decoder.onnx``, which this library does not run and takes as long to export."""
+    import torch
 
-    return made_once(tmp_path_factory, "onnx", lambda folder: export(shallow_da3, folder / "bundle")) / "bundle"
+    from backends import onnx
+
+    def export_encoder(backend: onnx.Exportable, folder: Path) -> dict[str, float]:
+        encoder = onnx.Graph(backend, onnx.encode_tensors).eval()
+        tokens = onnx.token_names(len(backend.token_dims))
+        with torch.no_grad():
+            inputs = onnx.example_inputs(backend, *onnx.TRACED)
+            onnx.export_graph(encoder, inputs, ["images"], tokens, folder / onnx.ENCODER)
+        return {}
+
+    def export(folder: Path) -> None:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(onnx, "_export_graphs", export_encoder)
+            onnx.export(shallow_da3, folder / "bundle")
+
+    return made_once(tmp_path_factory, "onnx", export) / "bundle"
