@@ -72,6 +72,7 @@ class TrainingSamples(Dataset[Sample]):
         scenes: number of scenes per sample.
         views: number of views per scene.
         sizes: image sizes and their probabilities, ``((height, width, share), ...)``.
+        any_views: share of the samples, except walks, whose views are drawn whether they overlap or not.
     """
 
     def __init__(
@@ -84,10 +85,11 @@ class TrainingSamples(Dataset[Sample]):
         scenes: int = 1,
         views: int = 4,
         sizes: Sequence[Sequence[float]] = ((80, 160, 1.0),),
+        any_views: float = 0.0,
     ) -> None:
         self.files, self.count, self.seed = list(files), count, seed
         self.more, self.share = list(more), share if more else 0.0
-        self.scenes, self.views = scenes, views
+        self.scenes, self.views, self.any_views = scenes, views, any_views
         self.sizes = [(int(height), int(width)) for height, width, _ in sizes]
         shares = np.array([share for *_, share in sizes])
         self.shares = shares / shares.sum()
@@ -110,7 +112,7 @@ class TrainingSamples(Dataset[Sample]):
         while True:
             files = self.more if self.share and rng.random() < self.share else self.files
             path = files[rng.integers(len(files))]
-            views = _choose_views(read_scene(path), self.views, rng)
+            views = _choose_views(read_scene(path), self.views, self.any_views, rng)
             views = _turn(_crop(views, size, rng), turns)
             valid = views.depth[(views.depth > 0) & views.depth.isfinite()]
             if len(valid) >= _LEAST_PIXELS:
@@ -124,7 +126,7 @@ class _Crop(NamedTuple):
     intrinsics: Tensor  # [V, 3, 3]
 
 
-def _choose_views(scene: SceneFrames, count: int, rng: Generator) -> _Crop:
+def _choose_views(scene: SceneFrames, count: int, any_views: float, rng: Generator) -> _Crop:
     """Draws overlapping views: from a section of a walk, or for other paths, by overlap with a random view."""
     rotations = scene.world_to_camera[:, :3, :3]
     frames = len(scene.images)
@@ -138,13 +140,13 @@ def _choose_views(scene: SceneFrames, count: int, rng: Generator) -> _Crop:
             end += 1
         rows = np.sort(first + rng.permutation(end - first)[:count])
     else:
-        rows = _overlapping(scene, count, rng)
+        rows = _overlapping(scene, count, any_views, rng)
     images = scene.images[rows].permute(0, 3, 1, 2).float() / 255
     return _Crop(images, scene.depth[rows].float(), scene.world_to_camera[rows], scene.intrinsics[rows])
 
 
-def _overlapping(scene: SceneFrames, count: int, rng: Generator) -> NDArray[np.int64]:
-    """Draws a random view, and others with a probability that increases with their overlap."""
+def _overlapping(scene: SceneFrames, count: int, any_views: float, rng: Generator) -> NDArray[np.int64]:
+    """Draws a random view, and others with a probability that increases with their overlap, or any others."""
     first = int(rng.integers(len(scene.images)))
     height, width = scene.depth.shape[-2:]
     cameras = Cameras(scene.world_to_camera[None], scene.intrinsics[None], (height, width))
@@ -161,6 +163,8 @@ def _overlapping(scene: SceneFrames, count: int, rng: Generator) -> NDArray[np.i
     overlap = (inside & (z < 1.05 * there)).float().mean(1).numpy() if len(points) else np.ones(len(u))
     overlap[first] = 0
     likely = np.maximum(overlap, 1e-3) ** rng.uniform(0, 2) * np.where(overlap > _LEAST_OVERLAP, 1.0, 1e-4)
+    if any_views and rng.random() < any_views:
+        likely = np.ones(len(likely))
     likely[first] = 0
     return np.append(first, rng.choice(len(likely), count - 1, replace=False, p=likely / likely.sum()))
 

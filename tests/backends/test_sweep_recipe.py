@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 import torch
 from safetensors import safe_open
+from safetensors.torch import load_file, save_file
 from torch.nn import functional as F
 
 from backends.sweep.backend import SHIPPED, SweepBackend
 from backends.sweep.network import PosedViews, Sweep, SweepEncoding
 from backends.sweep.volume import from_inverse
+from recipes.sweep import average
 from recipes.sweep.objective import cell_inverse, objective
 from recipes.sweep.samples import Sample, TrainingSamples
 from recipes.sweep.scenes import read_infinigen, read_scene, scene_files
@@ -70,6 +72,40 @@ def test_samples_depend_on_their_number_alone(scenes: list[Path]) -> None:
     assert a.images.shape != other.images.shape or not torch.equal(a.images, other.images)
     assert (a.depth_range[:, 0] > 0).all()
     assert (a.depth_range[:, 0] < a.depth_range[:, 1]).all()
+
+
+def test_views_that_do_not_overlap_can_be_drawn(tmp_path: Path) -> None:
+    """A path that turns by 40 degrees a step: views without regard to overlap turn farther from one another."""
+    frames, turns = 9, np.deg2rad(40) * np.arange(9)
+    poses = torch.eye(4).repeat(frames, 1, 1)
+    cosine, sine = torch.from_numpy(np.cos(turns)).float(), torch.from_numpy(np.sin(turns)).float()
+    poses[:, 0, 0], poses[:, 0, 2], poses[:, 2, 0], poses[:, 2, 2] = cosine, sine, -sine, cosine
+    intrinsics = torch.tensor([[48.0, 0, 47.5], [0, 48, 23.5], [0, 0, 1]]).repeat(frames, 1, 1)
+    path = tmp_path / "00000001-48x96.npz"
+    arrays = {"images": np.zeros((frames, 48, 96, 3), np.uint8), "depth": np.full((frames, 48, 96), 2, np.float16)}
+    np.savez(path, **arrays, world_to_camera=poses.numpy(), intrinsics=intrinsics.numpy())
+
+    def farthest(any_views: float) -> list[float]:
+        samples = TrainingSamples([path], 30, seed=0, sizes=[(32, 64, 1)], any_views=any_views)
+        forward = [sample.world_to_camera[:, 2, :3] for sample in (samples[n] for n in range(30))]
+        return [float((each @ each.T).min()) for each in forward]
+
+    assert min(farthest(1.0)) < -0.7
+    assert np.mean(farthest(1.0)) < np.mean(farthest(0.0)) - 0.2
+
+
+def test_weights_are_averaged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    files = [tmp_path / f"{n}.safetensors" for n in range(3)]
+    for n, file in enumerate(files):
+        save_file({"a": torch.full((2,), 3.0 * n).half(), "b": torch.tensor([n])}, file)
+    monkeypatch.setattr(sys, "argv", ["average", *map(str, [tmp_path / "out.safetensors", *files])])
+    average.main()
+    mean = load_file(tmp_path / "out.safetensors")
+    assert torch.equal(mean["a"], torch.full((2,), 3.0).half())
+    assert torch.equal(mean["b"], torch.tensor([1]))
+    save_file({"a": torch.zeros(3), "b": torch.tensor([0])}, files[1])
+    with pytest.raises(ValueError, match=r"1\.safetensors does not hold the same network as .*0\.safetensors"):
+        average.main()
 
 
 def test_scenes_of_a_sample_are_encoded_as_if_alone(scenes: list[Path]) -> None:
