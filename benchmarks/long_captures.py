@@ -1,7 +1,7 @@
 """Long captures: ``python benchmarks/long_captures.py make|run|alone FOLDER``.
 
 ``make`` renders a walk through a corridor of furnished rooms as an RGB-D recording, and holds out every twentieth
-frame. ``run`` reconstructs the walk in windows, and measures peak memory, CPU time of every window, and PSNR on the
+frame. ``run`` reconstructs the walk in windows, and measures peak memory, the time of every stage, and PSNR on the
 held-out frames. ``alone`` reconstructs some rooms, each at once from its own frames, and compares PSNR on the same
 held-out frames; it needs the result of ``run``. Each prints JSON.
 """
@@ -12,8 +12,7 @@ import argparse
 import json
 import statistics
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -96,27 +95,6 @@ def make(folder: Path, scene: SyntheticScene, parts: dict[str, list[int]]) -> No
         write_recording(folder / name, Frames(images, depth, poses, intrinsics))
 
 
-class Clock(Monitor):
-    """Records the CPU time of every step of every stage that reports progress."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.steps: dict[str, list[float]] = {}
-
-    @contextmanager
-    def stage(self, name: str, total: int = 1) -> Iterator[Callable[..., None]]:
-        """See :meth:`Monitor.stage`."""
-        before = time.process_time()
-
-        def advance(done: float | None = None, note: str = "") -> None:
-            nonlocal before
-            now = time.process_time()
-            self.steps.setdefault(name, []).append(now - before)
-            before = now
-
-        yield advance
-
-
 def score(scene: Scene, folder: Path, numbers: Sequence[int], chosen: Sequence[int]) -> dict[int, float]:
     """Returns the PSNR of the chosen held-out frames by number; the scene must be in the recording's world frame."""
     source = RGBDFolder(str(folder / "held"), holdout=None)
@@ -131,25 +109,17 @@ def score(scene: Scene, folder: Path, numbers: Sequence[int], chosen: Sequence[i
 
 def run(folder: Path, ready: LoadedModel, window: int, held: Sequence[int]) -> None:
     """Reconstructs the walk in windows; keeps intermediate results in ``FOLDER/windows``, so that it can resume."""
-    clock, begin = Clock(), time.process_time()
-    scene = reconstruct_with(
-        ready.model,
-        folder / "walk",
-        window=window,
-        window_folder=folder / "windows",
-        renderer=ready.renderer,
-        monitor=clock,
-    )
+    clock, begin = Monitor(), time.process_time()
+    kept = {"window": window, "window_folder": folder / "windows"}
+    scene = reconstruct_with(ready.model, folder / "walk", **kept, renderer=ready.renderer, monitor=clock)
     total = time.process_time() - begin
     scores = score(scene, folder, held, held)
-    halves = {name: (times[: len(times) // 2], times[-(len(times) // 2) :]) for name, times in clock.steps.items()}
     found = {
         "views": len(scene.names),
         "gaussians": len(scene.gaussians),
         "peak_mib": round(clock.peak_memory_mib),
         "core_seconds": round(total, 1),
-        "seconds": {name: round(sum(times), 1) for name, times in clock.steps.items()},
-        "second_half_over_first": {n: round(sum(b) / sum(a), 3) for n, (a, b) in halves.items() if len(a) > 4},
+        "seconds": {name: round(seconds, 1) for name, seconds in clock.seconds.items()},
         "psnr": round(statistics.mean(scores.values()), 3),
     }
     print(json.dumps(found))

@@ -1,8 +1,8 @@
 """Speed of the renderer's implementations on a CPU: ``python benchmarks/render.py``; ``gpu.py`` measures a GPU.
 
 Measures all implementations alternately in one process and compares them by ratio. Times are the best of several
-passes, in core-milliseconds (with one thread unless the table says otherwise). Prints tables and writes a dated JSON
-file to ``benchmarks/results``.
+passes, in core-milliseconds. Prints the times and writes a dated
+JSON file to ``benchmarks/results``.
 
 The scene is a box-shaped room seen from inside, which imitates the output of a feed-forward model: one flat Gaussian
 per source pixel, slightly off the surface, slightly misaligned, with varied size and opacity.
@@ -18,7 +18,6 @@ from common import MEGABYTE, machine, parser, used_seconds, write_results
 from torch import Tensor
 from torch.nn import functional as F
 
-from vg2gt.evaluation.tables import print_table
 from vg2gt.geometry.cameras import invert_rigid
 from vg2gt.geometry.rotations import matrix_to_quat
 from vg2gt.geometry.spherical_harmonics import rgb_to_sh
@@ -174,21 +173,13 @@ def main() -> None:
     options.add_argument("--passes", type=int, default=3)
     arguments = options.parse_args()
     tables: dict[str, list[dict[str, object]]] = {}
-    head = ["implementation", "mode", "outputs", "Gaussians", "size", "views", "threads"]
-    head += ["forward", "backward", "total", "ratio"]
     for title, cases in suites().items():
         timings = compare(cases, torch.device("cpu"), arguments.passes)
-        rows = []
         for case, timing in zip(cases, timings, strict=True):
-            total, reference = timing.forward + timing.backward, timings[0].forward + timings[0].backward
-            row = [case.implementation, case.mode, "all" if case.geometry else "colour", f"{case.gaussians:,}"]
-            row += [f"{case.size[0]}x{case.size[1]}", str(case.views), str(case.threads)]
-            row += [f"{value:.1f}" for value in (timing.forward, timing.backward, total)]
-            rows.append([*row, f"{total / reference:.2f}"])
-        print_table(head, rows, title=f"{title} (core-milliseconds)", text_columns=7, width=120)
+            print(f"{title}: {case}, forward {timing.forward:.1f}, backward {timing.backward:.1f}")
         tables[title] = [asdict(case) | asdict(timing) for case, timing in zip(cases, timings, strict=True)]
-    content = {"machine": machine(), "unit": "core-milliseconds", "passes": arguments.passes, "tables": tables}
-    write_results(arguments.out, "render-cpu", content)
+    about = {"machine": machine(), "unit": "core-milliseconds", "passes": arguments.passes}
+    write_results(arguments.out, "render-cpu", about | {"tables": tables})
 
 
 if __name__ == "__main__":

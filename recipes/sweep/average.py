@@ -1,7 +1,6 @@
 """Averages weights: ``python -m recipes.sweep.average OUT FILE FILE...``.
 
-The mean of weights that were trained further from the same start is often better than each of them (Wortsman et al.,
-"Model soups", ICML 2022).
+Weights that continue one training in different ways are often worse than their mean ("Model soups", ICML 2022).
 """
 
 from __future__ import annotations
@@ -17,29 +16,20 @@ from vg2gt.io.files import write_bytes
 
 
 def average(files: list[Path]) -> dict[str, Tensor]:
-    """Returns the mean of the tensors of files of one network, in their data types.
-
-    Raises:
-        ValueError: if a file's tensors have other names or shapes than the first one's.
-    """
+    """Returns the mean of the tensors of files that hold the same network."""
     states = [load_file(file) for file in files]
     shapes = [{name: tensor.shape for name, tensor in state.items()} for state in states]
     for file, other in zip(files, shapes, strict=True):
         if other != shapes[0]:
             raise ValueError(f"{file} does not hold the same network as {files[0]}")
-    return {
-        name: torch.stack([state[name].double() for state in states]).mean(0).to(first.dtype)
-        for name, first in sorted(states[0].items())
-    }
+    means = {name: torch.stack([state[name].double() for state in states]).mean(0) for name in sorted(states[0])}
+    return {name: mean.to(states[0][name].dtype) for name, mean in means.items()}
 
 
 def main() -> None:
     """Averages the files given on the command line."""
-    if len(sys.argv) < 4:
-        raise SystemExit(__doc__)
-    out, *files = map(Path, sys.argv[1:])
-    made_of = {"mean_of": ", ".join(file.name for file in files)}
-    print(write_bytes(out, save(average(files), metadata=made_of)))
+    out, *files = map(Path, sys.argv[1:] if len(sys.argv) > 3 else sys.exit(__doc__))
+    print(write_bytes(out, save(average(files), metadata={"mean_of": ", ".join(file.name for file in files)})))
 
 
 if __name__ == "__main__":

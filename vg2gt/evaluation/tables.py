@@ -6,10 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
-
 
 @dataclass(frozen=True)
 class Metric:
@@ -98,21 +94,3 @@ def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]], text_colu
         for row in (head, *rows)
     ]
     return "\n".join(f"| {' | '.join(cells)} |" for cells in (lines[0], rule, *lines[1:]))
-
-
-def print_table(
-    head: Sequence[str],
-    rows: Sequence[Sequence[str]],
-    *,
-    title: str | None = None,
-    caption: str | None = None,
-    text_columns: int = 1,
-    width: int = 110,
-) -> None:
-    """Prints a table at most ``width`` characters wide; cells and alignment as in :func:`markdown_table`."""
-    table = Table(title=title, caption=caption)
-    for index, heading in enumerate(head):
-        table.add_column(heading, justify="left" if index < text_columns else "right")
-    for row in rows:
-        table.add_row(*map(escape, row))
-    Console(width=width).print(table)
