@@ -1,7 +1,7 @@
 """Long captures: ``python benchmarks/long_captures.py make|run|alone FOLDER``.
 
 ``make`` renders a walk through a corridor of furnished rooms as an RGB-D recording, and holds out every twentieth
-frame. ``run`` reconstructs the walk in windows, and measures peak memory, the time of every stage, and PSNR on the
+frame. ``run`` reconstructs the walk in windows, and measures peak memory, the wall time of every stage, and PSNR on the
 held-out frames. ``alone`` reconstructs some rooms, each at once from its own frames, and compares PSNR on the same
 held-out frames; it needs the result of ``run``. Each prints JSON.
 """
@@ -109,17 +109,18 @@ def score(scene: Scene, folder: Path, numbers: Sequence[int], chosen: Sequence[i
 
 def run(folder: Path, ready: LoadedModel, window: int, held: Sequence[int]) -> None:
     """Reconstructs the walk in windows; keeps intermediate results in ``FOLDER/windows``, so that it can resume."""
-    clock, begin = Monitor(), time.process_time()
-    kept = {"window": window, "window_folder": folder / "windows"}
-    scene = reconstruct_with(ready.model, folder / "walk", **kept, renderer=ready.renderer, monitor=clock)
+    monitor, begin, kept = Monitor(), time.process_time(), folder / "windows"
+    scene = reconstruct_with(
+        ready.model, folder / "walk", window=window, window_folder=kept, renderer=ready.renderer, monitor=monitor
+    )
     total = time.process_time() - begin
     scores = score(scene, folder, held, held)
     found = {
         "views": len(scene.names),
         "gaussians": len(scene.gaussians),
-        "peak_mib": round(clock.peak_memory_mib),
+        "peak_mib": round(monitor.peak_memory_mib),
         "core_seconds": round(total, 1),
-        "seconds": {name: round(seconds, 1) for name, seconds in clock.seconds.items()},
+        "wall_seconds": {name: round(seconds, 1) for name, seconds in monitor.seconds.items()},
         "psnr": round(statistics.mean(scores.values()), 3),
     }
     print(json.dumps(found))

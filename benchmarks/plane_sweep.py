@@ -91,10 +91,9 @@ def main() -> None:
     backend = SweepBackend(path=options.weights)
     sets: dict[str, dict[str, dict[str, float]]] = {}
     for name, overrides in SETS.items():
-        given = vars(options)
-        if any(f"{{{place}}}" in overrides and given[place] is None for place in ("shared", "infinigen")):
+        if any(f"{{{place}}}" in overrides and not getattr(options, place) for place in ("shared", "infinigen")):
             continue
-        rows = [measure(backend, batch) for batch in batches(overrides.format(**given))]
+        rows = [measure(backend, batch) for batch in batches(overrides.format(**vars(options)))]
         figures = {key: sum(row[key] for row in rows) / len(rows) for key in rows[0]}
         sets[name] = {"network": figures}
         print(f"{name:18}", " ".join(f"{key} {value:.4f}" for key, value in figures.items()), flush=True)

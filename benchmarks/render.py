@@ -1,8 +1,7 @@
 """Speed of the renderer's implementations on a CPU: ``python benchmarks/render.py``; ``gpu.py`` measures a GPU.
 
-Measures all implementations alternately in one process and compares them by ratio. Times are the best of several
-passes, in core-milliseconds. Prints the times and writes a dated
-JSON file to ``benchmarks/results``.
+Measures all cases alternately in one process and prints their ratio to the first. Times are the best of several passes,
+in core-milliseconds. Writes a dated JSON file to ``benchmarks/results``.
 
 The scene is a box-shaped room seen from inside, which imitates the output of a feed-forward model: one flat Gaussian
 per source pixel, slightly off the surface, slightly misaligned, with varied size and opacity.
@@ -176,10 +175,11 @@ def main() -> None:
     for title, cases in suites().items():
         timings = compare(cases, torch.device("cpu"), arguments.passes)
         for case, timing in zip(cases, timings, strict=True):
-            print(f"{title}: {case}, forward {timing.forward:.1f}, backward {timing.backward:.1f}")
+            ratio = (timing.forward + timing.backward) / (timings[0].forward + timings[0].backward)
+            print(f"{title}: {case}, forward {timing.forward:.1f}, backward {timing.backward:.1f}, ratio {ratio:.2f}")
         tables[title] = [asdict(case) | asdict(timing) for case, timing in zip(cases, timings, strict=True)]
-    about = {"machine": machine(), "unit": "core-milliseconds", "passes": arguments.passes}
-    write_results(arguments.out, "render-cpu", about | {"tables": tables})
+    content = {"machine": machine(), "unit": "core-milliseconds", "passes": arguments.passes, "tables": tables}
+    write_results(arguments.out, "render-cpu", content)
 
 
 if __name__ == "__main__":

@@ -28,7 +28,9 @@ def average(files: list[Path]) -> dict[str, Tensor]:
 
 def main() -> None:
     """Averages the files given on the command line."""
-    out, *files = map(Path, sys.argv[1:] if len(sys.argv) > 3 else sys.exit(__doc__))
+    if len(sys.argv) < 4:
+        sys.exit(__doc__)
+    out, *files = map(Path, sys.argv[1:])
     print(write_bytes(out, save(average(files), metadata={"mean_of": ", ".join(file.name for file in files)})))
 
 

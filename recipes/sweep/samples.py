@@ -161,7 +161,6 @@ def _overlapping(scene: SceneFrames, count: int, any_views: float, rng: Generato
     rows = torch.arange(len(u))[:, None]
     there = scene.depth[rows, v.clamp(0, height - 1), u.clamp(0, width - 1)].float()
     overlap = (inside & (z < 1.05 * there)).float().mean(1).numpy() if len(points) else np.ones(len(u))
-    overlap[first] = 0
     likely = np.maximum(overlap, 1e-3) ** rng.uniform(0, 2) * np.where(overlap > _LEAST_OVERLAP, 1.0, 1e-4)
     if any_views and rng.random() < any_views:
         likely = np.ones(len(likely))

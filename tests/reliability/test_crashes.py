@@ -15,9 +15,10 @@ MOMENTS = (
     harness.in_last_evaluation,
     harness.while_the_report_is_written,
 )
+FEW = (harness.while_a_checkpoint_is_written, harness.in_last_evaluation)
 
 
-@pytest.mark.parametrize("moments", [MOMENTS[1:4:2], pytest.param(MOMENTS, marks=pytest.mark.slow)], ids=["two", "all"])
+@pytest.mark.parametrize("moments", [FEW, pytest.param(MOMENTS, marks=pytest.mark.slow)], ids=["few", "all"])
 def test_killed_run_equals_uninterrupted(moments: Sequence[Moment], tmp_path: Path, cache: Path, whole: Path) -> None:
     """Killed at one moment after another; and stays as it is when it is started once more, as a queue may do."""
     folder = tmp_path / "run"
