@@ -55,9 +55,8 @@ def objective(
         inverse = inverse.clamp_min(1 / beyond_planes)
         t = from_inverse(inverse, sample.depth_range)
         planes.append(_cross_entropy(sweep, t, known))
-        most = torch.where(t > 1, 1.0, 0.3)  # what is nearer than the nearest plane is out of reach otherwise
         for position in (sweep.t, encoding.refined if cell == 4 else encoding.center):
-            positions.append(_mean(torch.minimum((position - t).abs(), most), known))
+            positions.append(_mean((position - t).abs().clamp_max(0.3), known))
         if cell == 2:
             terms["swept"] = _mean((encoding.swept[:, :1] + inverse.log()).abs().clamp_max(_CLAMP), finite)
     terms["planes"] = torch.stack(planes).sum()

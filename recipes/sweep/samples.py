@@ -23,9 +23,9 @@ from vg2gt.geometry.cameras import crop_intrinsics, project, resize_intrinsics, 
 from vg2gt.types import Cameras
 
 _UPRIGHT_SHARE = 0.3  # of samples rotated by 90 degrees to portrait format
-_CUT_SHARE = 0.25  # of samples whose planes end before the scene does; of others whose planes begin behind its start
-# Range of the depth quantile at which they end; higher indoors, where walls are near. Range of that where they begin.
-_CUT, _CUT_INDOORS, _CUT_NEAR = (0.5, 0.98), (0.85, 0.98), (0.02, 0.25)
+_CUT_SHARE = 0.25  # of samples whose planes do not cover the whole depth of the scene
+# Range of the depth quantile at which they end; higher indoors, where walls are near.
+_CUT, _CUT_INDOORS = (0.5, 0.98), (0.85, 0.98)
 _LEAST_OVERLAP = 0.15
 _WALK_FRAMES, _WALK_STEP = 14, math.radians(9)  # maximum frames and median rotation between frames of a walk
 _PLANES = (32, 48)  # few sizes, as convolutions on CPUs are compiled for each
@@ -220,8 +220,6 @@ def _finish(views: _Crop, valid: Tensor, cut: tuple[float, float], sources: int,
     if rng.random() < _CUT_SHARE:  # as when structure from motion finds no points in the background
         high = float(unit * torch.quantile(some, rng.uniform(*cut)))
     near = low * math.exp(-(rng.uniform(0.02, 0.5) if rng.random() < 0.75 else rng.uniform(0, 1.8)))
-    if rng.random() < _CUT_SHARE:  # as when the wide sweeps miss what few views see
-        near = min(float(unit * torch.quantile(some, rng.uniform(*_CUT_NEAR))), 0.7 * high)
     far = high * math.exp(rng.uniform(0, 0.6) if rng.random() < 0.75 else rng.uniform(0, 2.5))
     if rng.random() < _POSE_SHARE:
         turns = torch.from_numpy(rng.normal(0, _TURN, (len(poses), 3))).float()
