@@ -18,7 +18,7 @@ from hydra.utils import instantiate
 from backends.sweep import SweepBackend
 from vg2gt import __version__
 from vg2gt.config import compose
-from vg2gt.metrics import pixel_kinds
+from vg2gt.metrics.kinds import KINDS, pixel_kinds
 from vg2gt.types import Batch, Hints
 
 MADE = " data.eval_scenes={scenes} data.image_size=[112,224]"
@@ -91,10 +91,12 @@ def main() -> None:
             continue
         rows = [measure(backend, batch) for batch in batches(overrides.format(**vars(options)))]
         figures = {key: sum(row[key] for row in rows) / len(rows) for key in rows[0]}
-        for kind in [key.removeprefix("share ") for key in figures if key.startswith("share ")]:  # from sums to means
+        for kind in KINDS:  # the parts of abs_rel of all windows, to means over the pixels of that kind
             figures[f"abs_rel {kind}"] = figures.pop(f"error {kind}") / max(figures[f"share {kind}"], 1e-9)
         sets[name] = figures
-        print(f"{name:18}", " ".join(f"{key} {value:.4f}" for key, value in figures.items()), flush=True)
+        print(f"{name:18}", " ".join(f"{key} {value:.4f}" for key, value in figures.items() if " " not in key))
+        kinds = (f"{kind} {figures[f'share {kind}']:.0%} {figures[f'abs_rel {kind}']:.3f}" for kind in KINDS)
+        print(" " * 18, ", ".join(kinds), flush=True)
     content = {"machine": machine(), "version": __version__, "weights": backend.identity()["weights"], "sets": sets}
     write_results(options.out, "plane_sweep", content)
 

@@ -10,21 +10,23 @@ from vg2gt.geometry.cameras import project, unproject
 from vg2gt.metrics.depth import near_depth_edges
 from vg2gt.types import Cameras
 
-_WEAK, _TEXTURED = 0.012, 0.03  # standard deviation of grey in 7x7 pixels, from which texture is weak, and plain
+KINDS = ("alone", "edge", "bare", "weak", "textured")
+_WEAK, _TEXTURED = 0.012, 0.03  # least deviation of grey of weak and of clear texture
 _SAME = 0.05  # relative difference of depth up to which two views see the same surface
 
 
 def pixel_kinds(images: Tensor, depth: Tensor, cameras: Cameras) -> dict[str, Tensor]:
-    """Sorts the pixels of one scene by what other views see of them, and by texture.
+    """Sorts the pixels of one scene by whether other views see them, and by texture.
 
     Args:
-        images: ``[V, 3, H, W]`` in [0, 1].
-        depth: ground-truth z-depth ``[V, H, W]``; 0 is unknown.
+        images: ``[V, 3, H, W]`` in [0, 1], H and W at least 7.
+        depth: ground-truth z-depth ``[V, H, W]``; 0 and infinity are unknown.
         cameras: cameras of one scene, ``[1, V]``.
 
     Returns:
-        Masks ``[V, H, W]``. Every pixel of known depth is in exactly one of ``alone`` (no other view sees its surface),
-        ``edge`` (near a step of depth), ``bare``, ``weak`` and ``textured``.
+        Masks ``[V, H, W]`` by name. Every pixel of known depth is in exactly one: ``alone``, no other view sees its
+        surface (the same depth within 5 %); ``edge``, see :func:`near_depth_edges`; else by the standard deviation of
+        grey within 7x7 pixels, ``bare`` below 0.012, ``weak`` below 0.03, ``textured`` from there on.
     """
     valid = (depth > 0) & depth.isfinite()
     alone = ~_seen_by_others(torch.where(valid, depth, 0.0), cameras)
@@ -33,13 +35,9 @@ def pixel_kinds(images: Tensor, depth: Tensor, cameras: Cameras) -> dict[str, Te
     variance = F.avg_pool2d(grey**2, 7, 1) - F.avg_pool2d(grey, 7, 1) ** 2
     deviation = variance[:, 0].clamp_min(0).sqrt()  # [V, H, W]
     smooth = valid & ~alone & ~edge
-    return {
-        "alone": valid & alone,
-        "edge": valid & ~alone & edge,
-        "bare": smooth & (deviation < _WEAK),
-        "weak": smooth & (deviation >= _WEAK) & (deviation < _TEXTURED),
-        "textured": smooth & (deviation >= _TEXTURED),
-    }
+    bare, textured = deviation < _WEAK, deviation >= _TEXTURED
+    masks = (valid & alone, valid & ~alone & edge, smooth & bare, smooth & ~bare & ~textured, smooth & textured)
+    return dict(zip(KINDS, masks, strict=True))
 
 
 def _seen_by_others(depth: Tensor, cameras: Cameras) -> Tensor:
