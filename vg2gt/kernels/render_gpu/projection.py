@@ -101,7 +101,7 @@ def project_kernel(
     u, v = x * iz, y * iz
     us, vs = u, v
     if not solid:
-        x_limit, y_limit = _CLAMP * (width / fx), _CLAMP * (height / fy)
+        x_limit, y_limit = (width / fx) * _CLAMP, (height / fy) * _CLAMP  # the tensor first, for Triton 3.7
         us, vs = tl.minimum(tl.maximum(u, -x_limit), x_limit), tl.minimum(tl.maximum(v, -y_limit), y_limit)
     # axes in the camera frame, screen covariance and its inverse
     norm = 1.0 / tl.sqrt(tl.maximum(square, _TINY))

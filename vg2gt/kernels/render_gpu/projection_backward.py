@@ -120,7 +120,7 @@ def project_backward_kernel(
                 u, v_ = x * iz, y * iz
                 us, vs = u, v_
                 if not solid:
-                    x_limit, y_limit = _CLAMP * (width / fx), _CLAMP * (height / fy)
+                    x_limit, y_limit = (width / fx) * _CLAMP, (height / fy) * _CLAMP  # the tensor first, for Triton 3.7
                     us = tl.minimum(tl.maximum(u, -x_limit), x_limit)
                     vs = tl.minimum(tl.maximum(v_, -y_limit), y_limit)
                 b00, b10, b20, jx0, jy0, h0 = along_axis(
