@@ -133,21 +133,34 @@ class OracleBackend(Backend):
             depth = depth * torch.exp(self.response * residual.reshape(depth.shape))
         return Geometry(depth, tokens.state["confidence"], cameras, torch.ones_like(depth[:, 0, 0, 0]))
 
+    @torch.no_grad()
+    def predict_cameras(self, images: Tensor, hints: Hints | None = None) -> Cameras:
+        """See :meth:`Backend.predict_cameras`; makes neither tokens nor depth."""
+        self.check_images(images)
+        hints = self.require_hints(images, hints, "depth", "cameras", "scene_key", "frame_ids")
+        assert hints.depth is not None
+        assert hints.cameras is not None
+        with full_precision(images):
+            depth = hints.depth.float()
+            return self._predict_cameras(hints.cameras, depth, self._noise(hints, (NOISE_GRID, (1, 1), (6,)), depth)[2])
+
     def _draw(self, hints: Hints, size: tuple[int, int], like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Unit noise of depth ``[B, V, H, W]``, cameras ``[B, V, 6]`` and confidence, from one generator per view."""
+        """Unit noise of depth ``[B, V, H, W]``, cameras ``[B, V, 6]`` and confidence ``[B, V, H, W]``."""
+        fields, constants, poses, doubt = self._noise(hints, (NOISE_GRID, (1, 1), (6,), size), like)
+        smooth = F.interpolate(fields, size, mode="bicubic", align_corners=True)
+        smooth = smooth / smooth.std((-2, -1), keepdim=True)
+        return SMOOTH_SHARE * smooth + VIEW_SHARE * constants, poses, doubt
+
+    def _noise(self, hints: Hints, shapes: tuple[tuple[int, ...], ...], like: Tensor) -> list[Tensor]:
+        """Draws ``[B, V, *shape]`` of every shape, in this order, from one generator per view."""
         assert hints.frame_ids is not None
         named = zip(hints.scene_key, hints.frame_ids.tolist(), strict=True)
         names = [f"{self.seed}/{scene}/{frame}" for scene, frames in named for frame in frames]
         digests = [hashlib.sha256(name.encode()).digest() for name in names]
         rngs = [np.random.default_rng(int.from_bytes(digest, "big")) for digest in digests]
-        shapes = (NOISE_GRID, (1, 1), (6,), size)
         views = [[rng.standard_normal(shape, dtype=np.float32) for shape in shapes] for rng in rngs]
-        fields, constants, poses, doubt = (
-            torch.from_numpy(np.stack(part)).to(like).unflatten(0, like.shape[:2]) for part in zip(*views, strict=True)
-        )
-        smooth = F.interpolate(fields, size, mode="bicubic", align_corners=True)
-        smooth = smooth / smooth.std((-2, -1), keepdim=True)
-        return SMOOTH_SHARE * smooth + VIEW_SHARE * constants, poses, doubt
+        parts = zip(*views, strict=True)
+        return [torch.from_numpy(np.stack(part)).to(like).unflatten(0, like.shape[:2]) for part in parts]
 
     def _predict_cameras(self, cameras: Cameras, depth: Tensor, pose_noise: Tensor) -> Cameras:
         """Perturbs every camera but the first in its own frame; the world frame becomes that of view 0."""

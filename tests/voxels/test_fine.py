@@ -6,6 +6,8 @@ import torch
 
 from tests.voxels.conftest import take_views
 from vg2gt.geometry.cameras import camera_centers, scale_translations, unproject
+from vg2gt.method.additions.point_moments import pool_point_moments
+from vg2gt.method.grid import plan_voxels, pool_mean
 
 
 def test_voxels_hold_the_weighted_means_of_their_pixels(make_fine, make_room):
@@ -159,6 +161,19 @@ def test_moments_are_the_covariances_of_the_pixels(make_fine, make_room):
             torch.testing.assert_close(voxels.moments.pixel[row].double(), (share[:, 0] * depth).sum() / focal / 0.125)
             sight = voxels.centroid[row] - camera_centers(geometry.cameras)[scene].mean(0)
             assert (voxels.moments.facing[row] * sight).sum() < 0
+
+
+def test_compiled_moments_equal_the_reference():
+    cells = torch.randint(0, 6, (600, 3))
+    plan = plan_voxels(cells, torch.zeros(600, dtype=torch.long), torch.rand(600) > 0.1)
+    values, depth, confidence, views = torch.rand(600, 6) - 0.5, torch.rand(600) + 1, torch.rand(600), torch.rand(3, 4)
+    inputs = [values, depth, confidence, views + 0.5, pool_mean(values, confidence, plan)]
+    compiled = pool_point_moments(*inputs, plan, views_per_chunk=2)
+    reference = pool_point_moments(*(tensor.double() for tensor in inputs), plan, views_per_chunk=2)
+    for found, expected in zip(compiled, reference, strict=True):
+        assert found.dtype == torch.float32
+        assert expected.dtype == torch.float64
+        torch.testing.assert_close(found.double(), expected, atol=1e-6, rtol=1e-5)
 
 
 def test_fringes_of_silhouettes_make_no_voxels(make_fine, make_room):

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from vg2gt.kernels.curve_codes import hilbert_codes, z_codes
+from vg2gt.kernels.curve_codes import hilbert_codes, hilbert_reference, z_codes
 from vg2gt.method.serialization import ORDERS, make_windows, serial_codes, serial_keys
 
 
@@ -17,6 +17,13 @@ def test_consecutive_hilbert_codes_are_face_neighbours(bits):
     assert torch.equal(codes.sort().values, torch.arange(len(cells)))
     steps = cells[codes.argsort()].diff(dim=0).abs().sum(1)
     assert steps.eq(1).all()
+
+
+@pytest.mark.parametrize("bits", [1, 9, 21])
+def test_compiled_hilbert_codes_equal_the_reference(bits):
+    cells = torch.randint(0, 1 << bits, (500, 3))
+    assert torch.equal(hilbert_codes(cells, bits), hilbert_reference(cells, bits))
+    assert len(hilbert_codes(cells[:0], bits)) == 0
 
 
 def test_dropping_three_bits_gives_the_parent_and_z_order_interleaves_bits():

@@ -1,4 +1,4 @@
-"""Codes of cells on space-filling curves: Morton in torch; Hilbert in torch and Triton (CUDA devices)."""
+"""Codes of cells on space-filling curves: Morton in torch; Hilbert in torch, numba (CPUs) and Triton (CUDA devices)."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import importlib.util
 
 import torch
 from torch import Tensor
+
+from vg2gt.kernels.compiled import kernel
 
 
 def z_codes(grid: Tensor) -> Tensor:
@@ -24,7 +26,7 @@ def z_codes(grid: Tensor) -> Tensor:
 
 
 def hilbert_codes(grid: Tensor, bits: int) -> Tensor:
-    """Hilbert codes of cells (J. Skilling, "Programming the Hilbert curve", 2004), in one kernel on CUDA devices.
+    """Hilbert codes of cells (J. Skilling, "Programming the Hilbert curve", 2004); compiled on CPUs and CUDA devices.
 
     Args:
         grid: ``[M, 3]`` int64 with 0 <= coordinate < 2^bits.
@@ -37,7 +39,38 @@ def hilbert_codes(grid: Tensor, bits: int) -> Tensor:
         from vg2gt.kernels.hilbert import hilbert_in_one_kernel
 
         return hilbert_in_one_kernel(grid, bits)
+    if grid.device.type == "cpu":
+        axes = torch.empty_like(grid)
+        _hilbert_axes(grid.numpy(), bits, axes.numpy())
+        return z_codes(axes)
     return hilbert_reference(grid, bits)
+
+
+@kernel(nogil=True)
+def _hilbert_axes(grid, bits, axes):
+    """:func:`hilbert_reference`, one cell after the other, up to the Morton codes."""
+    for m in range(len(grid)):
+        x, y, z = grid[m, 0], grid[m, 1], grid[m, 2]
+        for level in range(bits - 1, 0, -1):
+            below = (1 << level) - 1
+            if x >> level & 1:
+                x ^= below
+            if y >> level & 1:
+                x ^= below
+            else:
+                swapped = (x ^ y) & below
+                x, y = x ^ swapped, y ^ swapped
+            if z >> level & 1:
+                x ^= below
+            else:
+                swapped = (x ^ z) & below
+                x, z = x ^ swapped, z ^ swapped
+        y ^= x
+        z ^= y
+        flip = 0
+        for level in range(bits - 1, 0, -1):
+            flip ^= ((1 << level) - 1) * (z >> level & 1)
+        axes[m, 0], axes[m, 1], axes[m, 2] = x ^ flip, y ^ flip, z ^ flip
 
 
 def has_kernel(device: torch.device) -> bool:

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from vg2gt.kernels.point_moments import moments_in_one_pass
+from vg2gt.kernels.threads import compilable
 from vg2gt.method.grid import VoxelPlan, pool_mean_of_chunks
 
 Moments = tuple[Tensor, Tensor, Tensor, Tensor]
@@ -24,7 +26,7 @@ def pool_point_moments(
     plan: VoxelPlan,
     views_per_chunk: int,
 ) -> Moments:
-    """Confidence-weighted second moments in every voxel, without gradient.
+    """Confidence-weighted second moments in every voxel, without gradient; compiled for float32 on a CPU.
 
     Args:
         values: ``[N, 6]`` positions of the points in their cells, and colours; N / V points per view, in view order.
@@ -33,7 +35,7 @@ def pool_point_moments(
         views: ``[V, 4]`` camera centre in scene units, and edge of a voxel in pixels at depth 1.
         means: ``[M, 6]`` means of ``values`` in every voxel.
         plan: the voxels.
-        views_per_chunk: views at a time; bounds the memory.
+        views_per_chunk: views at a time where it is not compiled; bounds the memory.
 
     Returns:
         Covariances ``[M, 3, 3]`` of position and ``[M, 3 (position), 3 (colour)]`` of position and colour, mean camera
@@ -50,6 +52,10 @@ def pool_point_moments(
         return torch.cat((both, eye, depth[rows, None] / edge), -1)  # [n, 22]
 
     chunks = (products(first) for first in range(0, len(views), views_per_chunk))
-    both, eye, pixel = pool_mean_of_chunks(chunks, confidence, plan).split((18, 3, 1), -1)
+    if compilable(values, depth, confidence, views, means):
+        found = moments_in_one_pass(values, depth, confidence, views, means, plan.order, plan.starts, plan.counts)
+    else:
+        found = pool_mean_of_chunks(chunks, confidence, plan)
+    both, eye, pixel = found.split((18, 3, 1), -1)
     spread, cross = both.unflatten(-1, (3, 6)).split(3, -1)
     return spread, cross, eye, pixel[:, 0]
