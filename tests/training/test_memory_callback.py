@@ -1,5 +1,7 @@
 """The callback that returns freed memory to the system."""
 
+import os
+import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -57,3 +59,24 @@ def test_every_run_on_a_cpu_has_it(tmp_path: Path, cache: Path, monkeypatch: pyt
 def test_negative_growth_is_refused(tmp_path: Path, cache: Path) -> None:
     with pytest.raises(InstantiationException, match="growth_mb must not be negative"):
         build(small_config(tmp_path, cache, "callbacks.memory.growth_mb=-1"))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="torch asks for large pages on Linux only")
+@pytest.mark.parametrize("chosen", [None, "0"])
+def test_tensors_of_a_training_lie_on_large_pages(chosen: str | None, tmp_path: Path) -> None:
+    """torch aligns their memory to pages (4096 bytes), and to 64 bytes otherwise."""
+    code = f"""
+import sys, types
+sys.modules["vg2gt.training.loop"] = types.SimpleNamespace(train=lambda config: None)
+from vg2gt.cli.train import main
+sys.argv = ["train.py"]
+main()
+assert "torch" not in sys.modules
+import torch
+tensors = [torch.empty(2**22 + size) for size in range(4)]
+assert all(tensor.data_ptr() % 4096 == 0 for tensor in tensors) is {chosen is None}
+"""
+    others = {name: value for name, value in os.environ.items() if name != "THP_MEM_ALLOC_ENABLE"}
+    environment = others | ({} if chosen is None else {"THP_MEM_ALLOC_ENABLE": chosen})
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
