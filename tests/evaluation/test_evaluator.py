@@ -165,17 +165,17 @@ def test_the_joint_pass_may_have_another_unit(module_and_batch, batch: Batch, vi
     module, _ = module_and_batch
     inputs = replace(batch, num_context=views)
     backend = module.model.backend
-    decode = backend.decode
+    decode, predict_cameras, three = backend.decode, backend.predict_cameras, torch.full((1,), 3.0)
 
     def rescaled(tokens):
         geometry = decode(tokens)
-        cameras = scale_translations(geometry.cameras, torch.full((1,), 3.0))
-        return replace(geometry, depth=geometry.depth * 3, cameras=cameras)
+        return replace(geometry, depth=geometry.depth * 3, cameras=scale_translations(geometry.cameras, three))
 
     with torch.no_grad():
         prediction = module.model(inputs.context.images, inputs.context.hints)
     plain = joint_target_cameras(module.model, inputs, prediction)
     monkeypatch.setattr(backend, "decode", rescaled)
+    monkeypatch.setattr(backend, "predict_cameras", lambda *args: scale_translations(predict_cameras(*args), three))
     found = joint_target_cameras(module.model, inputs, prediction)
     torch.testing.assert_close(found.world_to_camera, plain.world_to_camera, rtol=1e-4, atol=1e-5)
 
