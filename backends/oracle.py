@@ -99,16 +99,13 @@ class OracleBackend(Backend):
     @torch.no_grad()
     def encode(self, images: Tensor, hints: Hints | None = None) -> Tokens:
         """Simulates the backbone; see :meth:`Backend.encode`. The world frame is that of view 0, in the data's unit."""
-        self.check_images(images)
-        hints = self.require_hints(images, hints, "depth", "cameras", "scene_key", "frame_ids")
-        assert hints.depth is not None
-        assert hints.cameras is not None
+        hints, depth, cameras = self._checked(images, hints)
         height, width = images.shape[-2:]
         grid = (height // self.patch_size, width // self.patch_size)
         with full_precision(images):
-            images, depth = images.float(), hints.depth.float()
+            images, depth = images.float(), depth.float()
             relative, poses, doubt = self._draw(hints, (height, width), depth)
-            cameras = self._predict_cameras(hints.cameras, depth, poses)
+            cameras = self._predict_cameras(cameras, depth, poses)
             predicted = _bleed(depth * (1 + self.depth_noise * relative))
             error = (predicted / depth.clamp_min(1e-6) - 1).abs()
             confidence = 1 + 4 * torch.exp(-error / max(self.depth_noise, 0.01)) * torch.exp(0.3 * doubt)
@@ -136,13 +133,19 @@ class OracleBackend(Backend):
     @torch.no_grad()
     def predict_cameras(self, images: Tensor, hints: Hints | None = None) -> Cameras:
         """See :meth:`Backend.predict_cameras`; makes neither tokens nor depth."""
+        hints, depth, cameras = self._checked(images, hints)
+        with full_precision(images):
+            depth = depth.float()
+            poses = self._noise(hints, (NOISE_GRID, (1, 1), (6,)), depth)[2]
+            return self._predict_cameras(cameras, depth, poses)
+
+    def _checked(self, images: Tensor, hints: Hints | None) -> tuple[Hints, Tensor, Cameras]:
+        """Returns the hints, their depth and their cameras if they are there for all images."""
         self.check_images(images)
         hints = self.require_hints(images, hints, "depth", "cameras", "scene_key", "frame_ids")
         assert hints.depth is not None
         assert hints.cameras is not None
-        with full_precision(images):
-            depth = hints.depth.float()
-            return self._predict_cameras(hints.cameras, depth, self._noise(hints, (NOISE_GRID, (1, 1), (6,)), depth)[2])
+        return hints, hints.depth, hints.cameras
 
     def _draw(self, hints: Hints, size: tuple[int, int], like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Unit noise of depth ``[B, V, H, W]``, cameras ``[B, V, 6]`` and confidence ``[B, V, H, W]``."""

@@ -33,8 +33,8 @@ STEPS = 6
 LOSS_TOLERANCE = 5e-3  # of the largest loss, in every step
 COSINE = 0.998  # of every step's gradient before clipping
 # Surfels are a twentieth of a voxel thick: what rounding moves by as much shows in depth, normals and colour, and what
-# it moves over a silhouette shows in one step's whole gradient.
-SURFEL_LOSS_TOLERANCE, SURFEL_COSINE, SURFEL_WORST = 2e-2, 0.99, 0.98
+# it moves over a silhouette shows in one step's whole gradient (0.976 to 0.997 for the same step of equal trainings).
+SURFEL_LOSS_TOLERANCE, SURFEL_COSINE, SURFEL_MEAN = 2e-2, 0.99, 0.995
 PLAIN = ("model.gaussians.start=plain", "model.fine.moments=false", "model.fine.drop_fringes=false")
 METRIC_TOLERANCE = {"psnr": 0.1, "ssim": 0.01, "abs_rel": 0.005, "decoded_abs_rel": 0.001, "coverage": 0.01}
 
@@ -90,8 +90,11 @@ def check_agreement(overrides: tuple[str, ...], steps: int, folder: Path, cache:
         assert other != one  # autocast was on
     assert len(noted.cosines) == steps
     worst, second = sorted(noted.cosines)[:2]
-    assert worst > (SURFEL_WORST if surfels else COSINE)
-    assert second > (SURFEL_COSINE if surfels else COSINE)
+    if surfels:
+        assert second > SURFEL_COSINE
+        assert sum(noted.cosines) / steps > SURFEL_MEAN
+    else:
+        assert worst > COSINE
     exact.datamodule.setup("validate")
     batch = next(iter(exact.datamodule.val_dataloader()))
     scores = []
