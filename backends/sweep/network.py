@@ -12,7 +12,7 @@ from backends.sweep.correlate import SourceWarp
 from backends.sweep.features import CONTEXT_COARSE, FeaturePyramid, Features, unit_groups
 from backends.sweep.refine import DepthHead, RefineNet, convex_upsample, slices
 from backends.sweep.tokens import PATCH, TokenNet, patch_places
-from backends.sweep.views import agreed_range, choose_sources, wide_range
+from backends.sweep.views import agreed_range, choose_sources, overlaps, view_ranges, wide_range
 from backends.sweep.volume import PlaneSweep, VolumeNet, agreement, expectation, near_and_far, to_inverse
 from vg2gt.geometry.cameras import resize_intrinsics
 from vg2gt.geometry.precision import full_precision
@@ -130,7 +130,7 @@ class SweepNet(nn.Module):
         return Sweep(logits, position, t, mass), agreeing
 
     def find_range(self, features: Features, views: PosedViews, sources: int, hint: Tensor | None = None) -> Tensor:
-        """Finds the range of depths on which the views agree, with wide sweeps at low resolution.
+        """Finds the range of depths of every view, from those on which views agree in wide sweeps at low resolution.
 
         A hint is searched beyond its limits, as sparse points lie on texture and miss near surfaces that few views see.
         Without a hint, a first sweep finds near, and a second sweep starts there so that its planes resolve far.
@@ -142,8 +142,8 @@ class SweepNet(nn.Module):
             hint: known near and far ``[2]``; None searches a range derived from the cameras.
 
         Returns:
-            Near and far ``[2]``, including the hint if there is one. If hardly any depth agrees, the hint or the
-            searched range.
+            Near and far ``[V, 2]``, including the hint if there is one; see :func:`view_ranges`. If hardly any depth
+            agrees, they are those of the hint or the searched range.
         """
         maps, stride = features.coarse, 4
         while maps.shape[-2] * maps.shape[-1] > _RANGE_CELLS:
@@ -158,11 +158,13 @@ class SweepNet(nn.Module):
 
         if hint is not None:
             found = search(hint * hint.new_tensor(_BEYOND), hint)
-            return torch.stack((torch.minimum(found[0], hint[0]), torch.maximum(found[1], hint[1])))
-        wide = wide_range(views.world_to_camera)
-        first = search(wide, wide)
-        # Sky and windows agree at any large depth, between the last two planes: ignore those.
-        return search(torch.stack((_NEARER * first[0], wide[1])), first, least=1 / (WIDE_PLANES - 1))
+            found = torch.stack((torch.minimum(found[0], hint[0]), torch.maximum(found[1], hint[1])))
+        else:
+            wide = wide_range(views.world_to_camera)
+            first = search(wide, wide)
+            # Sky and windows agree at any large depth, between the last two planes: ignore those.
+            found = search(torch.stack((_NEARER * first[0], wide[1])), first, least=1 / (WIDE_PLANES - 1))
+        return view_ranges(found, overlaps(views.world_to_camera, views.intrinsics, views.size, found))
 
     def encode(
         self, features: Features, views: PosedViews, depth_range: Tensor, sources: Tensor, planes: int

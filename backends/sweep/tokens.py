@@ -91,7 +91,7 @@ def patch_places(
         depth: depth of the patches ``[V, P]``.
         world_to_camera: ``[V, 4, 4]``.
         intrinsics: ``[V, 3, 3]``, at image resolution.
-        depth_range: near and far, ``[2]`` or ``[V, 2]``; their geometric mean is the unit of length.
+        depth_range: near and far, ``[2]`` or ``[V, 2]``; their geometric mean in a scene is the unit of length.
         size: patches per axis.
         scenes: number of scenes that the views belong to.
 
@@ -101,7 +101,8 @@ def patch_places(
     views = len(world_to_camera) // scenes
     pose = world_to_camera[::views].repeat_interleave(views, 0) @ torch.linalg.inv(world_to_camera)
     ray = rays(resize_intrinsics(intrinsics, 1 / PATCH, 1 / PATCH), size)  # [V, 3, P]
-    unit = depth_range.prod(-1).sqrt().view(-1, 1, 1)
+    unit = depth_range.expand(len(depth), 2).log().view(scenes, -1).mean(1).exp()
+    unit = unit.repeat_interleave(views)[:, None, None]
     point = (pose[:, :3, :3] @ (ray * depth[:, None]) + pose[:, :3, 3:]) / unit
     direction = F.normalize(pose[:, :3, :3] @ ray, dim=1)
     waves = [wave(point * number) for number in _WAVENUMBERS for wave in (torch.sin, torch.cos)]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -14,6 +16,9 @@ _LEAST_PARALLAX, _MOST_PARALLAX = 0.08, 0.5
 _SEEN_AGAIN = 0.4  # factor on a point's score for every source that already sees it
 _WIDE = (0.1, 40.0)  # range of the first sweep, in units of the largest distance between cameras
 _NEAREST = 0.03  # minimum near of the first sweep, in the same unit
+_OVERLAP = 0.5  # a view of which others see less than this may see something nearer than near
+_NEARER_ALONE = 0.3  # minimum factor on near in such a view
+_TURN = 1.2  # maximum angle between views that count for it, in radians
 
 
 def rays(intrinsics: Tensor, size: tuple[int, int]) -> Tensor:
@@ -50,7 +55,7 @@ def choose_sources(
         world_to_camera: ``[V, 4, 4]``.
         intrinsics: ``[V, 3, 3]`` in pixels.
         size: image ``(height, width)``.
-        depth_range: near and far ``[2]``.
+        depth_range: near and far, ``[2]`` or ``[V, 2]``.
         count: number of sources per view; at most V - 1 are returned.
         noise: ``[V, V]``, added to the logarithms of the scores (training).
 
@@ -58,35 +63,49 @@ def choose_sources(
         Indices of the sources ``[V, n]``, best first.
     """
     views = len(world_to_camera)
+    inside, poses, depths = _seen_by(world_to_camera, intrinsics, size, depth_range)
+    # reward for parallax: [V, s]
+    parallax = poses[..., :3, 3].norm(dim=-1) / depths[:, _DEPTHS // 2, None]
+    reward = parallax / (parallax + _LEAST_PARALLAX) / (1 + (parallax / _MOST_PARALLAX) ** 2)
+    if noise is not None:
+        reward = reward * torch.exp(noise)
+    seen = inside.float()  # [V, s, z p]
+    left = torch.ones_like(seen[:, 0])  # [V, z p] weights of the points for the next source
+    reward = reward.masked_fill(torch.eye(views, dtype=torch.bool, device=reward.device), -torch.inf)
+    chosen, everyone = [], torch.arange(views, device=seen.device)
+    for _ in range(min(count, views - 1)):
+        score = (seen * left[:, None]).mean(-1).clamp_min(1e-6) * reward  # [V, s]
+        best = score.argmax(1)
+        chosen.append(best)
+        left = left * torch.where(seen[everyone, best] > 0, _SEEN_AGAIN, 1.0)
+        reward = reward.scatter(1, best[:, None], -torch.inf)
+    return torch.stack(chosen, 1)
+
+
+def _seen_by(
+    world_to_camera: Tensor, intrinsics: Tensor, size: tuple[int, int], depth_range: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Tests which points between near and far of every view V are inside which other view s.
+
+    Returns:
+        Whether they are ``[V, s, z p]``, transforms from every view to every other ``[V, s, 4, 4]``, and the depths of
+        the points ``[V, z]``.
+    """
+    views = len(world_to_camera)
     scaled = resize_intrinsics(intrinsics, _GRID[1] / size[1], _GRID[0] / size[0])
-    near, far = depth_range.unbind()
+    near, far = depth_range.expand(views, 2).unsqueeze(-1).unbind(1)  # [V, 1]
     steps = torch.linspace(0, 1, _DEPTHS + 2, device=near.device)[1:-1]
-    depths = 1 / (1 / far + steps * (1 / near - 1 / far))
+    depths = 1 / (1 / far + steps * (1 / near - 1 / far))  # [V, z]
     # sample points of every view, projected into every possible source
-    points = rays(scaled, _GRID)[:, None] * depths[None, :, None, None]  # [V, z, 3, p]
+    points = rays(scaled, _GRID)[:, None] * depths[..., None, None]  # [V, z, 3, p]
     everyone = torch.arange(views, device=near.device).expand(views, views)
-    poses = relative_poses(world_to_camera, everyone)  # [V, s, 4, 4]
+    poses = relative_poses(world_to_camera, everyone)
     seen = torch.einsum("vsij,vzjp->vszip", poses[..., :3, :3], points) + poses[:, :, None, :3, 3:]
     pixels = torch.einsum("sij,vszjp->vszip", scaled, seen)
     z = pixels[..., 2, :]
     u, v = (pixels[..., axis, :] / z.clamp_min(1e-6) for axis in (0, 1))
     inside = (z > 0) & (u > -0.5) & (u < _GRID[1] - 0.5) & (v > -0.5) & (v < _GRID[0] - 0.5)
-    # reward for parallax: [V, s]
-    parallax = poses[..., :3, 3].norm(dim=-1) / depths[_DEPTHS // 2]
-    reward = parallax / (parallax + _LEAST_PARALLAX) / (1 + (parallax / _MOST_PARALLAX) ** 2)
-    if noise is not None:
-        reward = reward * torch.exp(noise)
-    seen = inside.flatten(2).float()  # [V, s, z p]
-    left = torch.ones_like(seen[:, 0])  # [V, z p] weights of the points for the next source
-    reward = reward.masked_fill(torch.eye(views, dtype=torch.bool, device=reward.device), -torch.inf)
-    chosen = []
-    for _ in range(min(count, views - 1)):
-        score = (seen * left[:, None]).mean(-1).clamp_min(1e-6) * reward  # [V, s]
-        best = score.argmax(1)
-        chosen.append(best)
-        left = left * torch.where(seen[everyone[0], best] > 0, _SEEN_AGAIN, 1.0)
-        reward = reward.scatter(1, best[:, None], -torch.inf)
-    return torch.stack(chosen, 1)
+    return inside.flatten(2), poses, depths
 
 
 def camera_distances(world_to_camera: Tensor) -> Tensor:
@@ -123,3 +142,30 @@ def agreed_range(depth: Tensor, agreement: Tensor, fallback: Tensor) -> Tensor:
         return fallback
     low, high = agreed[int(0.01 * len(agreed))], agreed[int(0.99 * len(agreed))]
     return torch.stack((low * 0.8, high * 1.4))
+
+
+def overlaps(world_to_camera: Tensor, intrinsics: Tensor, size: tuple[int, int], depth_range: Tensor) -> Tensor:
+    """Returns the share of every view, between near and far, that others see from a similar direction ``[V]``.
+
+    Args:
+        world_to_camera: ``[V, 4, 4]``.
+        intrinsics: ``[V, 3, 3]`` in pixels.
+        size: image ``(height, width)``.
+        depth_range: near and far ``[2]``.
+    """
+    inside, poses, _ = _seen_by(world_to_camera, intrinsics, size, depth_range)
+    similar = (poses[..., 2, 2] > math.cos(_TURN)).fill_diagonal_(False)
+    return (inside & similar[..., None]).any(1).float().mean(1)
+
+
+def view_ranges(depth_range: Tensor, overlap: Tensor) -> Tensor:
+    """Returns near and far of every view ``[V, 2]``, with a smaller near where views overlap little with others.
+
+    What no other view sees, such as a wall next to the last camera, is often nearer than all that two views see.
+
+    Args:
+        depth_range: near and far of the depths on which the views agree ``[2]``.
+        overlap: share of each view that others see ``[V]``; see :func:`overlaps`.
+    """
+    near = depth_range[0] * (overlap / _OVERLAP).clamp(_NEARER_ALONE, 1)
+    return torch.stack((near, depth_range[1].expand_as(near)), 1)

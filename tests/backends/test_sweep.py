@@ -7,7 +7,7 @@ from torch import Tensor
 from backends.sweep.backend import SweepBackend
 from backends.sweep.correlate import GROUPS, SourceWarp, correlate, correlate_reference
 from backends.sweep.network import PosedViews
-from backends.sweep.views import agreed_range, choose_sources, wide_range
+from backends.sweep.views import agreed_range, choose_sources, view_ranges, wide_range
 from backends.sweep.volume import agreement
 from vg2gt.data import SyntheticScenes
 from vg2gt.types import Batch, Cameras, Hints
@@ -104,6 +104,8 @@ def test_ranges() -> None:
     found = agreed_range(depth, agreeing, wide_range(poses))
     torch.testing.assert_close(found, torch.tensor([2.02 * 0.8, 3.98 * 1.4]), rtol=1e-2, atol=0)
     assert torch.equal(agreed_range(depth, 0 * agreeing, wide_range(poses)), wide_range(poses))
+    each = view_ranges(torch.tensor([2.0, 9.0]), torch.tensor([0.9, 0.5, 0.25, 0.0]))  # seen by others less and less
+    torch.testing.assert_close(each, torch.tensor([[2.0, 9.0], [2.0, 9.0], [1.0, 9.0], [0.6, 9.0]]))
 
 
 def test_depth_is_in_the_unit_of_the_cameras_and_those_in_one_place_are_refused(make_scene) -> None:
@@ -148,16 +150,20 @@ def test_the_range_comes_from_the_cameras_and_a_given_one_is_searched_beyond(uns
     features = network.features(images)
     low, high = (float(unseen_room.depth.quantile(q)) for q in (0.02, 0.98))
     alone = cameras.world_to_camera[0].clone()
-    alone[-1, :3, 3] += alone[-1, :3, :3] @ torch.tensor([0.0, 8.0, 0.0])  # above the room: it sees nothing
+    alone[-1, :3, 3] += alone[-1, :3, :3] @ torch.tensor([0.0, 8.0, 0.0])  # above the room, and turned away:
+    alone[-1] = torch.diag(torch.tensor([-1.0, 1, -1, 1])) @ alone[-1]  # it sees nothing that others see
     for poses in (alone, cameras.world_to_camera[0]):
         views = PosedViews(images, poses, cameras.intrinsics[0])
-        near, far = network.find_range(features, views, 3).tolist()
+        ranges = network.find_range(features, views, 3)
+        assert torch.equal(ranges[:, 1], ranges[:1, 1].expand(8))
+        (near, far), shortened = ranges[0].tolist(), ranges[:, 0] < 0.99 * ranges[:, 0].max()
+        assert shortened.tolist() == [False] * 7 + [poses is alone]  # what it sees may be nearer
         assert 0.4 * low < near < 1.1 * low
         assert 0.9 * high < far < 2.5 * high
     # Sparse points miss what is near in few views; told too little, the sweep finds the rest.
     low, middle, high = (float(unseen_room.depth.quantile(q)) for q in (0.05, 0.5, 0.95))
-    near, far = network.find_range(features, views, 3, torch.tensor([0.9 * middle, 1.1 * middle])).tolist()
-    wide = network.find_range(features, views, 3, torch.tensor([0.5 * low, 2 * high])).tolist()
+    near, far = network.find_range(features, views, 3, torch.tensor([0.9 * middle, 1.1 * middle]))[0].tolist()
+    wide = network.find_range(features, views, 3, torch.tensor([0.5 * low, 2 * high]))[0].tolist()
     assert 0.45 * middle * 0.8 <= near < max(low, 0.6 * middle)
     assert min(high, 1.4 * middle) < far < 3.3 * middle * 1.4
     assert wide[0] <= 0.5 * low
