@@ -17,9 +17,7 @@ from torch import Tensor
 from torch.nn import functional as F
 from torch.utils.data import Dataset
 
-from backends.sweep.correlate import SourceWarp
-from backends.sweep.views import agreed_range, choose_sources, view_ranges
-from backends.sweep.volume import agreement
+from backends.sweep.views import choose_sources
 from recipes.sweep.scenes import SceneFrames, is_room, read_scene
 from vg2gt.geometry.cameras import crop_intrinsics, project, resize_intrinsics, rigid_motions, unproject
 from vg2gt.types import Cameras
@@ -36,8 +34,6 @@ _SOURCE_NOISE = 0.4  # on log-scores, so that training also sees pairs other tha
 _POSE_SHARE, _TURN, _SHIFT = 0.5, 0.0015, 0.002  # share of samples with pose noise; rad; in depths
 _LEAST_PIXELS = 5000  # with known depth; samples with fewer are drawn again
 _GREY_SHARE = 0.2
-# Share of samples with ranges as the network finds them, their noise (log), and factor on the share that others see.
-_FOUND_SHARE, _RANGE_NOISE, _MATCHED = 0.6, 0.1, (0.5, 1.25)
 
 
 class Sample(NamedTuple):
@@ -212,10 +208,9 @@ def _turn(views: _Crop, turns: int) -> _Crop:
 
 
 def _finish(views: _Crop, valid: Tensor, cut: tuple[float, float], sources: int, rng: Generator) -> Sample:
-    """Draws the unit of length, the ranges of the planes, pose noise, sources and colours of a sample.
+    """Draws the unit of length, the range of the planes, pose noise, sources and colours of a sample.
 
-    In some samples the ranges are those that the network finds where all that two views see agrees. Others contain the
-    true range, except in some samples whose planes end at a depth quantile within ``cut``.
+    The range contains the true one, except in some samples whose planes end at a depth quantile within ``cut``.
     """
     unit = math.exp(rng.normal(0, 0.5))  # random unit, so that the network cannot rely on it
     poses, depth = views.world_to_camera.clone(), views.depth * unit
@@ -226,32 +221,15 @@ def _finish(views: _Crop, valid: Tensor, cut: tuple[float, float], sources: int,
         high = float(unit * torch.quantile(some, rng.uniform(*cut)))
     near = low * math.exp(-(rng.uniform(0.02, 0.5) if rng.random() < 0.75 else rng.uniform(0, 1.8)))
     far = high * math.exp(rng.uniform(0, 0.6) if rng.random() < 0.75 else rng.uniform(0, 2.5))
-    ranges = torch.tensor([near, far]).expand(len(poses), 2)
-    if rng.random() < _FOUND_SHARE:
-        ranges = _found_ranges(depth, poses, views.intrinsics, ranges[0], rng)
     if rng.random() < _POSE_SHARE:
         turns = torch.from_numpy(rng.normal(0, _TURN, (len(poses), 3))).float()
         shifts = torch.from_numpy(rng.normal(0, _SHIFT * min(middle, 3 * low), (len(poses), 3))).float()
         poses = rigid_motions(turns, shifts) @ poses
-    size = (depth.shape[-2], depth.shape[-1])
+    depth_range, size = torch.tensor([near, far]), (depth.shape[-2], depth.shape[-1])
     noise = torch.from_numpy(rng.normal(0, _SOURCE_NOISE, (len(poses), len(poses)))).float()
-    chosen = choose_sources(poses, views.intrinsics, size, ranges, sources, noise)
+    chosen = choose_sources(poses, views.intrinsics, size, depth_range, sources, noise)
     look = recolour(views.images, rng)
-    return Sample(look, depth, poses, views.intrinsics, ranges, chosen)
-
-
-def _found_ranges(depth: Tensor, poses: Tensor, intrinsics: Tensor, fallback: Tensor, rng: Generator) -> Tensor:
-    """Ranges of the views ``[V, 2]`` as in :meth:`SweepNet.find_range`, if all pixels that two views see agree."""
-    depth = depth[:, None, 2::4, 2::4]
-    known = (depth > 0) & depth.isfinite()
-    others = torch.tensor([[other for other in range(len(poses)) if other != view] for view in range(len(poses))])
-    warp = SourceWarp(poses, resize_intrinsics(intrinsics, 0.25, 0.25), others, (depth.shape[-2], depth.shape[-1]))
-    agreeing = agreement(torch.where(known, 1 / depth, 1e-4), warp)[:, 1:2] * known
-    seen = (agreeing > 0.5).float().mean((1, 2, 3))
-    near_and_far = (
-        agreed_range(depth, agreeing, fallback) * torch.from_numpy(np.exp(rng.normal(0, _RANGE_NOISE, 2))).float()
-    )
-    return view_ranges(near_and_far, seen * rng.uniform(*_MATCHED))
+    return Sample(look, depth, poses, views.intrinsics, depth_range.expand(len(poses), 2), chosen)
 
 
 def recolour(images: Tensor, rng: Generator) -> Tensor:

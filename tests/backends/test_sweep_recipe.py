@@ -16,7 +16,7 @@ from backends.sweep.network import PosedViews, Sweep, SweepEncoding
 from backends.sweep.volume import from_inverse
 from recipes.sweep import average
 from recipes.sweep.objective import cell_inverse, objective
-from recipes.sweep.samples import Sample, TrainingSamples, _found_ranges
+from recipes.sweep.samples import Sample, TrainingSamples
 from recipes.sweep.scenes import read_infinigen, read_scene, scene_files
 from tests.commands import ROOT
 from tests.data.sources import layout_infinigen
@@ -72,20 +72,6 @@ def test_samples_depend_on_their_number_alone(scenes: list[Path]) -> None:
     assert a.images.shape != other.images.shape or not torch.equal(a.images, other.images)
     assert (a.depth_range[:, 0] > 0).all()
     assert (a.depth_range[:, 0] < a.depth_range[:, 1]).all()
-
-
-def test_ranges_of_samples_miss_what_one_view_sees(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Three cameras see a wall at 4; the last looks away, at something at 1 that no range as found contains."""
-    monkeypatch.setattr("recipes.sweep.samples._RANGE_NOISE", 0.0)
-    monkeypatch.setattr("recipes.sweep.samples._MATCHED", (1.0, 1.0))
-    poses, intrinsics = torch.eye(4).repeat(4, 1, 1), torch.tensor([[48.0, 0, 31.5], [0, 48, 23.5], [0, 0, 1]])
-    poses[:, 0, 3] = torch.tensor([0.0, -0.2, -0.4, 0.0])
-    poses[3, :3, :3] = torch.diag(torch.tensor([-1.0, 1, -1]))
-    depth = torch.full((4, 48, 64), 4.0)
-    depth[3] = 1.0
-    ranges = _found_ranges(depth, poses, intrinsics.repeat(4, 1, 1), torch.ones(2), np.random.default_rng(0))
-    torch.testing.assert_close(ranges[:3], torch.tensor([[3.2, 5.6]]).repeat(3, 1))
-    torch.testing.assert_close(ranges[3], torch.tensor([0.3 * 3.2, 5.6]))
 
 
 def test_views_that_do_not_overlap_can_be_drawn(tmp_path: Path) -> None:
