@@ -12,7 +12,7 @@ from backends.sweep.correlate import SourceWarp
 from backends.sweep.features import CONTEXT_COARSE, FeaturePyramid, Features, unit_groups
 from backends.sweep.refine import DepthHead, RefineNet, convex_upsample, slices
 from backends.sweep.tokens import PATCH, TokenNet, patch_places
-from backends.sweep.views import agreed_range, choose_sources, overlaps, view_ranges, wide_range
+from backends.sweep.views import agreed_range, choose_sources, view_ranges, wide_range
 from backends.sweep.volume import PlaneSweep, VolumeNet, agreement, expectation, near_and_far, to_inverse
 from vg2gt.geometry.cameras import resize_intrinsics
 from vg2gt.geometry.precision import full_precision
@@ -164,7 +164,7 @@ class SweepNet(nn.Module):
             first = search(wide, wide)
             # Sky and windows agree at any large depth, between the last two planes: ignore those.
             found = search(torch.stack((_NEARER * first[0], wide[1])), first, least=1 / (WIDE_PLANES - 1))
-        return view_ranges(found, overlaps(views.world_to_camera, views.intrinsics, views.size, found))
+        return view_ranges(views.world_to_camera, views.intrinsics, views.size, found)
 
     def encode(
         self, features: Features, views: PosedViews, depth_range: Tensor, sources: Tensor, planes: int

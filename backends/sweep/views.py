@@ -144,28 +144,19 @@ def agreed_range(depth: Tensor, agreement: Tensor, fallback: Tensor) -> Tensor:
     return torch.stack((low * 0.8, high * 1.4))
 
 
-def overlaps(world_to_camera: Tensor, intrinsics: Tensor, size: tuple[int, int], depth_range: Tensor) -> Tensor:
-    """Returns the share of every view, between near and far, that others see from a similar direction ``[V]``.
+def view_ranges(world_to_camera: Tensor, intrinsics: Tensor, size: tuple[int, int], depth_range: Tensor) -> Tensor:
+    """Returns near and far of every view ``[V, 2]``, with a smaller near where others see little of a view.
+
+    What no other view sees, such as a wall next to the last camera, is often nearer than all that two views see.
 
     Args:
         world_to_camera: ``[V, 4, 4]``.
         intrinsics: ``[V, 3, 3]`` in pixels.
         size: image ``(height, width)``.
-        depth_range: near and far ``[2]``.
+        depth_range: near and far of the depths on which the views agree ``[2]``.
     """
     inside, poses, _ = _seen_by(world_to_camera, intrinsics, size, depth_range)
     similar = (poses[..., 2, 2] > math.cos(_TURN)).fill_diagonal_(False)
-    return (inside & similar[..., None]).any(1).float().mean(1)
-
-
-def view_ranges(depth_range: Tensor, overlap: Tensor) -> Tensor:
-    """Returns near and far of every view ``[V, 2]``, with a smaller near where views overlap little with others.
-
-    What no other view sees, such as a wall next to the last camera, is often nearer than all that two views see.
-
-    Args:
-        depth_range: near and far of the depths on which the views agree ``[2]``.
-        overlap: share of each view that others see ``[V]``; see :func:`overlaps`.
-    """
+    overlap = (inside & similar[..., None]).any(1).float().mean(1)
     near = depth_range[0] * (overlap / _OVERLAP).clamp(_NEARER_ALONE, 1)
     return torch.stack((near, depth_range[1].expand_as(near)), 1)

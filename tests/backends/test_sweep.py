@@ -1,5 +1,7 @@
 """The plane sweep: its geometry, its kernels against their reference, its limits."""
 
+import math
+
 import pytest
 import torch
 from torch import Tensor
@@ -104,8 +106,24 @@ def test_ranges() -> None:
     found = agreed_range(depth, agreeing, wide_range(poses))
     torch.testing.assert_close(found, torch.tensor([2.02 * 0.8, 3.98 * 1.4]), rtol=1e-2, atol=0)
     assert torch.equal(agreed_range(depth, 0 * agreeing, wide_range(poses)), wide_range(poses))
-    each = view_ranges(torch.tensor([2.0, 9.0]), torch.tensor([0.9, 0.5, 0.25, 0.0]))  # seen by others less and less
-    torch.testing.assert_close(each, torch.tensor([[2.0, 9.0], [2.0, 9.0], [1.0, 9.0], [0.6, 9.0]]))
+
+
+def test_views_that_overlap_little_search_nearer() -> None:
+    """The last of four cameras looks away, then to the side, so that others see a part of what it sees."""
+    poses, intrinsics = row_of_cameras(4)
+
+    def near_of_the_last(turn: float) -> float:
+        turned = poses.clone()
+        cosine, sine = math.cos(turn), math.sin(turn)
+        turned[3, :3] = torch.tensor([[cosine, 0, -sine], [0, 1, 0], [sine, 0, cosine]]) @ poses[3, :3]
+        ranges = view_ranges(turned, intrinsics, (14, 22), torch.tensor([2.0, 9.0]))
+        torch.testing.assert_close(ranges[:3], torch.tensor([[2.0, 9.0]]).repeat(3, 1))
+        assert ranges[3, 1] == 9
+        return float(ranges[3, 0])
+
+    assert near_of_the_last(0.0) == 2
+    assert 0.6 < near_of_the_last(0.7) < 2
+    assert near_of_the_last(math.pi) == pytest.approx(0.6)
 
 
 def test_depth_is_in_the_unit_of_the_cameras_and_those_in_one_place_are_refused(make_scene) -> None:
