@@ -109,7 +109,7 @@ def test_ranges() -> None:
 
 
 def test_views_that_overlap_little_search_nearer() -> None:
-    """The last of four cameras looks away, then to the side, so that others see a part of what it sees."""
+    """The last of four cameras looks where the others do, then to the side, then away from them."""
     poses, intrinsics = row_of_cameras(4)
 
     def near_of_the_last(turn: float) -> float:
