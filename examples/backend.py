@@ -26,7 +26,9 @@ class LocalDepthBackend(Backend):
     """
 
     def __init__(self, network: nn.Module | None = None, patch_size: int = 14) -> None:
-        super().__init__("local_depth", patch_size, (4 * patch_size**2,), licence="mine", needs_hints=True)
+        super().__init__(
+            "local_depth", patch_size, (4 * patch_size**2,), "mine", needs_hints=True, predicts_cameras=False
+        )
         self.network = network or BrightIsNear()
         self.freeze()
 

@@ -108,6 +108,8 @@ class Reconstructor(nn.Module, ABC):
                 f"model.scale.source=metric requires a metric backend, but {backend.name} is not metric: "
                 "use model.scale.source=normalize or focal"
             )
+        if visibility is not None and not callable(visibility):  # options alone, such as +model.visibility.moment=3
+            raise ValueError("model.visibility has options but no check: this model has none, use model=tiny_ungated")
         backend.freeze()  # again: a subclass may have added layers after its parent's constructor froze the backend
         self.backend = backend
         self.scale = scale

@@ -11,7 +11,8 @@ class BrightIsNear(Backend):
     """Predicts depth as 2 minus brightness; a token holds the colours of a patch, and cameras come from the data."""
 
     def __init__(self, patch_size: int = 14) -> None:
-        super().__init__("bright", patch_size, (3 * patch_size**2,), licence="Apache-2.0", needs_hints=True)
+        dims = (3 * patch_size**2,)
+        super().__init__("bright", patch_size, dims, "Apache-2.0", needs_hints=True, predicts_cameras=False)
         self.freeze()
 
     def encode(self, images, hints=None):

@@ -74,6 +74,14 @@ def test_what_ships_needs_no_name() -> None:
     assert load_model(None, "sweep", ["backend.planes=32"], device="cpu").weights.path is None
 
 
+def test_views_check_the_depth_of_learned_backbones() -> None:
+    assert load_model(backend="da3_tiny", device="cpu").model.visibility is not None
+    assert load_model(backend="da3_tiny", overrides=["model=tiny"], device="cpu").model.visibility is None
+    assert load_model(backend="oracle", device="cpu").model.visibility is None
+    with pytest.raises(ValueError, match="this model has none, use model=tiny_ungated"):
+        load_model(backend="oracle", overrides=["+model.visibility.moment=3"], device="cpu")
+
+
 def test_another_backbone_is_refused(run_folder: Path) -> None:
     with pytest.raises(ValueError, match=r"trained on backbone .*oracle.*this run uses .*da3_tiny"):
         load_model(run_folder, "da3_tiny", device="cpu")

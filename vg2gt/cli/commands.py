@@ -50,7 +50,7 @@ COMMANDS = {
         "writes a frozen network as an ONNX bundle", "vg2gt export backend=da3_small --out bundles/da3_small"
     ),
     "data": Command("makes splits and lists of views", "vg2gt data splits data=rgbd data.root=RECORDINGS --out lists"),
-    "doctor": Command("checks this machine: packages, devices, renderer, correctness of the kernels", "vg2gt doctor"),
+    "doctor": Command("shows packages, devices and renderer; on a GPU, checks the renderer's kernels", "vg2gt doctor"),
 }
 
 DATA_COMMANDS = {

@@ -165,7 +165,8 @@ class Scene:
         """Optimises Gaussians and cameras on the scene's own images (:func:`vg2gt.refinement.refine`).
 
         Args:
-            options: options of the refinement; default :class:`vg2gt.refinement.RefineOptions`.
+            options: options of the refinement; default :class:`vg2gt.refinement.RefineOptions`, which suits RGB-D
+                recordings. ``configs/refine/photographs.yaml`` lists those that the command uses for photos.
             **changes: options to override, such as ``steps=50`` or ``holdout=8``.
 
         Returns:

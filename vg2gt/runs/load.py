@@ -89,15 +89,20 @@ def load_model(
 
     Args:
         ckpt: a checkpoint or a run's folder. None loads the weights that ship with the package (:data:`SHIPPED`), or
-            with a backend other than ``sweep`` the untrained head, which predicts coloured voxels.
+            with another backend than ``sweep``, or ``backend=sweep`` with options that change what it computes, the
+            untrained head of ``model=tiny_ungated`` (``oracle``: ``tiny``), which predicts coloured voxels.
         backend: a name in ``configs/backend``, short for the override ``backend=NAME``; None keeps the run's backend.
         overrides: command-line overrides. ``backend=NAME``, ``model=NAME`` and ``renderer=NAME`` replace a part of the
             run's configuration; ``backend.key=value`` and the like change one key.
         device: ``auto``, ``cpu``, ``cuda`` or ``cuda:N``.
         seed: seed of the untrained head.
 
+    Returns:
+        The model in eval mode, its renderer and the origin of its weights.
+
     Raises:
         FileNotFoundError: if there is no such checkpoint, or a weight file is missing.
+        ImportError: if the backend needs a package that is not installed.
         ValueError: if a name or an option is unknown, or the checkpoint belongs to another backbone.
     """
     checkpoint, parts = model_parts(ckpt, [*([f"backend={backend}"] if backend else []), *overrides])
@@ -127,6 +132,8 @@ def model_parts(ckpt: str | Path | None, overrides: Sequence[str]) -> tuple[Path
     suits = "backend" not in named or ("backend=sweep" in overrides and all(key in FREE for key in of_backend))
     checkpoint = checkpoint_path(SHIPPED if ckpt is None and suits else ckpt)
     chosen = [override for override, key in zip(overrides, keys, strict=True) if key.partition(".")[0] in named]
+    if checkpoint is None and "model" not in named and "backend=oracle" not in overrides:
+        chosen.append("model=tiny_ungated")  # learned depth is wrong in places, so views check each other
     parts = resolve_parts(compose_groups(*chosen) if chosen else OmegaConf.create(), checkpoint)
     config = OmegaConf.create({part: OmegaConf.to_container(parts[part]) for part in PARTS})
     for override in overrides:

@@ -37,7 +37,8 @@ def from_pretrained(
         The model in eval mode, its renderer and the origin of its weights.
 
     Raises:
-        FileNotFoundError: if there is no such model.
+        FileNotFoundError: if there is no such file or folder.
+        OSError: if there is no such repository on the Hub.
         ImportError: if it is on the Hub and huggingface_hub is not installed.
         ValueError: if it was trained on another backbone, or its files are damaged.
     """
@@ -83,6 +84,7 @@ def push_to_hub(ckpt: str | Path, repo: str, folder: str | Path, private: bool =
 
     Raises:
         ImportError: if huggingface_hub is not installed.
+        FileNotFoundError, ValueError: as in :func:`save_pretrained`.
     """
     try:
         from huggingface_hub import HfApi  # pyright: ignore[reportMissingImports]
