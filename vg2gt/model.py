@@ -218,9 +218,11 @@ class Reconstructor(nn.Module, ABC):
             backend: identity of the backbone it was trained on.
 
         Raises:
-            ValueError: if it was trained on another backbone or does not fit this model; nothing is loaded then.
+            ValueError: if it was trained on or with another backbone, or does not fit; nothing is loaded then.
         """
         self.check_backend(backend)
+        if self.backend.frozen and any(name.startswith(BACKBONE_PREFIX) for name in state):
+            raise ValueError("the checkpoint holds a trained backbone: use the same backend= with backend.freeze=false")
         present = {name: value.shape for name, value in self.trained_state().items()}
         stored = {name: value.shape for name, value in state.items() if self._stored(name)}
         if stored != present:

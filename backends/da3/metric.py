@@ -65,7 +65,8 @@ class DA3MetricBackend(NetworkBackend):
 
         ignorable = tuple(part for part in NESTED_PARTS if part != prefix)
         weights = Weights(name, licence, pretrained, repo, revision, path, seed, prefix, ignorable)
-        super().__init__(make, weights, patch_size, dim, taps, head_chunk, is_metric=True, needs_hints=True)
+        properties = {"is_metric": True, "needs_hints": True, "predicts_cameras": False}
+        super().__init__(make, weights, patch_size, dim, taps, head_chunk, **properties)
 
     def encode_checked(self, images: Tensor, hints: Hints | None) -> Tokens:
         """See :meth:`NetworkBackend.encode_checked`; token changes do not affect the scale factors of here."""
@@ -130,6 +131,8 @@ class DA3NestedBackend(Backend):
     """
 
     def __init__(self, relative: DA3Backend, metric: DA3MetricBackend, name: str = "da3_nested") -> None:
+        if not relative.frozen:
+            raise ValueError("backend.relative.freeze=false: this backend cannot be trained, use backend=da3_giant")
         licence = f"{relative.licence}; {metric.licence}"
         super().__init__(name, relative.patch_size, relative.token_dims, licence, is_metric=True)
         self.relative = relative

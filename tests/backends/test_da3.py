@@ -1,5 +1,6 @@
 import pytest
 import torch
+from hydra.errors import InstantiationException
 
 from backends.da3.backend import normalize_cameras
 from backends.da3.metric import fit_scale
@@ -70,6 +71,7 @@ def test_metric_depth_grows_with_the_focal_length(make_backend, make_scene) -> N
     one = backend.decode(backend.encode(images, hints))
     two = backend.decode(backend.encode(images, Hints(cameras=Cameras(hints.cameras.world_to_camera, twice, SIZE))))
     torch.testing.assert_close(two.depth, 2 * one.depth)
+    assert not backend.predicts_cameras
     assert torch.equal(one.cameras.world_to_camera, hints.cameras.world_to_camera)
     assert torch.equal(one.depth_conf, torch.ones_like(one.depth))
 
@@ -96,7 +98,13 @@ def test_nested_scale_ignores_sky_and_doubt() -> None:
 @pytest.fixture
 def make_nested(make_backend):
     shared = [f"relative.{o}" for o in (*HEADS, "ffn=mlp", "multiview_from=2", "taps=[1,3,5,7]", "depth=8")]
-    return lambda: make_backend("da3_nested", *shared, *(f"metric.{option}" for option in TINY_METRIC))
+    metric = [f"metric.{option}" for option in TINY_METRIC]
+    return lambda *more: make_backend("da3_nested", *shared, *metric, *more)
+
+
+def test_nested_cannot_be_trained(make_nested) -> None:
+    with pytest.raises(InstantiationException, match="cannot be trained, use backend=da3_giant"):
+        make_nested("relative.freeze=false")
 
 
 def test_nested_keeps_the_relative_geometry(make_nested, make_scene) -> None:

@@ -121,6 +121,12 @@ def test_masked_pixels_count_as_correct(result: SceneResult, batch: Batch) -> No
     right = psnr(render.color[0, :, :, :, 56:], truth.images[0, :, :, :, 56:])
     assert found["psnr"] == pytest.approx(float(right.mean()) + 10 * math.log10(2), abs=1e-3)
     assert found["ssim"] > image_metrics(render, truth)["ssim"]
+    none = torch.zeros_like(mask)
+    assert image_metrics(render, replace(truth, mask=none)) == {}
+    none[:, 0] = mask[:, 0]  # the others do not count
+    first = replace(truth, images=truth.images[:, :1], mask=mask[:, :1])
+    expected = image_metrics(replace(render, color=render.color[:, :1]), first)
+    assert image_metrics(render, replace(truth, mask=none)) == pytest.approx(expected)
 
 
 def test_points_of_unknown_pixels_are_not_wrong(batch: Batch) -> None:

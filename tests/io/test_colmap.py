@@ -95,6 +95,15 @@ def test_values_that_are_not_finite_are_refused(tmp_path: Path, name: str, chang
         io.read_colmap(tmp_path)
 
 
+def test_names_with_spaces_in_text(tmp_path: Path) -> None:
+    model = small_model()
+    names = {image.image_id: f"trip/day {image.image_id} of 3.png" for image in model.images.values()}
+    for number, name in names.items():
+        model.images[number].name = name
+    found = io.read_colmap(write(tmp_path, model, text=True))
+    assert {image.image_id: image.name for image in found.images.values()} == names
+
+
 def test_wrong_arguments_are_named() -> None:
     _, cameras = views_model()
     with pytest.raises(ValueError, match=r"names \(1\)"):

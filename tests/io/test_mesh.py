@@ -77,8 +77,11 @@ def test_depth_edges_make_no_bridges() -> None:
 @pytest.mark.parametrize("suffix", [".ply", ".glb"])
 def test_written_meshes_load(tmp_path: Path, sphere, suffix: str) -> None:
     *_, mesh = sphere
+    mesh.colors[:] = 188
     path = write_mesh(tmp_path / f"sphere{suffix}", mesh)
     loaded = trimesh.load_mesh(path)
+    assert isinstance(loaded.visual, trimesh.visual.ColorVisuals)
+    assert set(loaded.visual.vertex_colors[:, :3].flatten()) == {128 if suffix == ".glb" else 188}  # glTF: linear
     assert len(loaded.faces) == len(mesh.faces)
     vertices = mesh.vertices * ([1, -1, -1] if suffix == ".glb" else 1)  # glTF: y up
     np.testing.assert_allclose(loaded.bounds, [vertices.min(0), vertices.max(0)], atol=1e-5)

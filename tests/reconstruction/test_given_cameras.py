@@ -71,10 +71,33 @@ def test_cameras_are_looked_for_in_their_order(inside: bool, folder: Path, recor
     place = folder / "images" if inside else folder
     assert given_pictures(place) is None
     put_poses(folder, recording)
-    check_cameras(given_pictures(place), frames, "RGBDFolder")
+    check_cameras(given_pictures(place), frames, "poses")  # without depth, so not a recording
     for put, kind in ((put_colmap, "COLMAP"), (put_transforms, "Nerfstudio"), (put_cameras, "cameras.json")):
         put(folder, frames)
         check_cameras(given_pictures(place), frames, kind)
+
+
+def test_cameras_next_to_a_folder_may_be_of_another(folder: Path, recording: Path, frames) -> None:
+    shutil.copytree(folder / "images", folder / "kitchen")
+    put_poses(folder, recording)
+    (folder / "scan.r3d").touch()
+    for put in (None, put_colmap, put_transforms):
+        if put is not None:
+            put(folder, frames)
+        assert given_pictures(folder / "kitchen") is None
+    (folder / "scan.r3d").unlink()
+    assert len(given_pictures(folder / "images") or []) == 4
+
+
+def test_masks_of_photographs_with_poses(folder: Path, recording: Path) -> None:
+    put_poses(folder, recording)
+    (folder / "masks").mkdir()
+    half = np.zeros(SIZE, np.uint8)
+    half[:, SIZE[1] // 2 :] = 255
+    Image.fromarray(half).save(folder / "masks" / "008.png")
+    mask = load_views(given_pictures(folder) or [], SIZE, Monitor()).mask
+    assert mask is not None
+    assert mask.mean((1, 2)).tolist() == [0.5, 1, 1, 1]
 
 
 def test_depth_is_read_where_a_recording_has_it(recording: Path, tmp_path: Path, frames) -> None:

@@ -1,6 +1,7 @@
 """Every output is read back by its reader and says the same as the scene in memory."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from vg2gt import io
 from vg2gt.geometry.cameras import project
 from vg2gt.reconstruction.output_names import OUTPUTS
 from vg2gt.reconstruction.outputs import write_outputs
+from vg2gt.reconstruction.pipeline import reconstruct_with
 from vg2gt.reconstruction.scene import Scene
 
 
@@ -71,6 +73,21 @@ def test_nerfstudio(written: Path, scene: Scene) -> None:
         assert np.abs(frame.world_to_camera - camera.world_to_camera).max() < 1e-6
         assert np.abs(frame.lens.intrinsics() - camera.intrinsics).max() < 1e-9
     assert len(cloud(written / "nerfstudio" / transforms.ply_file_path)) > 5000
+
+
+def test_images_larger_than_their_depth_are_exported_at_its_size(recording: Path, ready, tmp_path: Path) -> None:
+    folder = shutil.copytree(recording, tmp_path / "recording")
+    for path in (folder / "images").iterdir():
+        with Image.open(path) as image:
+            image.resize((2 * image.width, 2 * image.height)).save(path)
+    k = np.loadtxt(folder / "K.txt")
+    k[:2] = 2 * k[:2] + [[0, 0, 0.5]]
+    np.savetxt(folder / "K.txt", k)
+    reconstruct_with(ready.model, folder).save(tmp_path / "out", ["nerfstudio"])
+    place = tmp_path / "out" / "nerfstudio"
+    for frame in io.read_transforms(place / "transforms.json").frames:
+        with Image.open(place / frame.file_path) as image:
+            assert image.size == (frame.lens.width, frame.lens.height)
 
 
 def test_points_and_meshes_lie_on_the_surfaces(written: Path, scene: Scene) -> None:

@@ -9,7 +9,7 @@ from vg2gt.io import read_video, video, write_video
 from vg2gt.reconstruction import pictures
 from vg2gt.reconstruction.inputs import load_views, working_size
 from vg2gt.reconstruction.monitor import Monitor
-from vg2gt.reconstruction.pictures import find_pictures
+from vg2gt.reconstruction.pictures import Picture, find_pictures, shrunk, with_unique_names
 
 
 def _views(images):
@@ -39,12 +39,24 @@ def test_frames_of_a_video(tmp_path: Path) -> None:
     for i, frame in enumerate(frames):
         frame[:, :i] = 255
     path = write_video(tmp_path / "clip.gif", frames)
-    assert len(find_pictures(path)) == 24  # every third: at most 32
+    assert len(find_pictures(path)) == 32
     chosen = find_pictures(path, max_images=3)
-    assert [p.name for p in chosen] == ["clip-000000", "clip-000024", "clip-000048"]
-    assert chosen[2].read((14, 14)).images.mean().item() == pytest.approx(48 / 70, abs=0.02)
+    assert [p.name for p in chosen] == ["clip-000000", "clip-000046", "clip-000069"]
+    assert chosen[2].read((14, 14)).images.mean().item() == pytest.approx(69 / 70, abs=0.02)
     mixed = find_pictures([frames[0], path, frames[1]], max_images=3)
-    assert [p.name for p in mixed] == ["image-000", "clip-000024", "image-001"]
+    assert [p.name for p in mixed] == ["image-000", "clip-000046", "image-001"]
+
+
+def test_a_reduced_photograph_fits_its_camera() -> None:
+    ramp = np.tile(np.arange(0, 250, 2, np.uint8)[:, None], (81, 1, 3))
+    small = shrunk(ramp, (20, 31))[0, :, 0].astype(float) / 2
+    expected = (np.arange(len(small)) + 0.5) * 125 / len(small) - 0.5
+    assert np.abs(small - expected)[1:-1].max() < 0.3  # a quarter from rounding
+
+
+def test_numbers_make_names_unique() -> None:
+    pictures = [Picture(name, (8, 8), lambda size: None) for name in ("a", "a", "a-000")]  # type: ignore[arg-type]
+    assert [each.name for each in with_unique_names(pictures)] == ["a-001", "a-002", "a-000"]
 
 
 def test_working_size() -> None:

@@ -8,12 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from vg2gt.cli import main
 from vg2gt.cli.reconstruct import _refinement
 from vg2gt.io import read_cameras_json, read_gaussian_ply, write_cameras_json
+from vg2gt.reconstruction.saved import near_of, read_scene
 from vg2gt.reconstruction.scene import Scene
 from vg2gt.refinement import RefineOptions, RefineRates
+from vg2gt.rendering import Renderer
 
 ORACLE = ["backend=oracle", "backend.depth_noise=0.02", "--quiet", "--device", "cpu"]
 
@@ -61,6 +64,14 @@ def test_photographs_are_refined_unless_asked_not_to(scene: Scene) -> None:
     recording = replace(scene, cameras_from="RGBDFolder somewhere")
     assert _refinement(recording, None) is None
     assert _refinement(recording, 7) == RefineOptions(steps=7)
+
+
+def test_the_near_plane_is_that_of_the_scene(saved, tmp_path) -> None:
+    folder = shutil.copytree(saved, tmp_path / "copy", ignore=shutil.ignore_patterns("refined"))
+    assert read_scene(folder, Renderer(), torch.device("cpu")).renderer.near == Renderer().near
+    (folder / "report.json").write_text(json.dumps({"near": 0.002}))
+    assert read_scene(folder, Renderer(), torch.device("cpu")).renderer.near == 0.002
+    assert near_of(tmp_path) == Renderer().near
 
 
 @pytest.mark.parametrize(

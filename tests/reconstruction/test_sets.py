@@ -92,6 +92,36 @@ def test_the_scene_without_them_is_the_scene_that_never_saw_them(parts, tmp_path
     assert len(read_cameras_json(tmp_path / "scene" / "cameras.json")) == 4
 
 
+def test_taking_out_can_be_repeated_until_the_scene_is_written(parts, tmp_path, monkeypatch) -> None:
+    start(parts, tmp_path / "scene")
+    before = (tmp_path / "scene" / "scene.ply").read_bytes()
+    rest = [
+        str(parts[1]),
+        "--quiet",
+        "--device",
+        "cpu",
+        "--window",
+        "4",
+        "--refine",
+        "0",
+        *BY_ITSELF,
+        "model.coarse=null",
+    ]
+    command.main(["--add", str(tmp_path / "scene"), *rest])
+    with pytest.raises(SystemExit, match="--size, --drop cannot be combined with --add or --take-out"):
+        command.main(["--take-out", str(tmp_path / "scene"), "--drop", "guessed", "--size", "56", *rest])
+    with monkeypatch.context() as patch, pytest.raises(SystemExit, match="disk full"):
+        patch.setattr("vg2gt.reconstruction.outputs.write_outputs", full)
+        command.main(["--take-out", str(tmp_path / "scene"), *rest])
+    command.main(["--take-out", str(tmp_path / "scene"), *rest])
+    assert (tmp_path / "scene" / "scene.ply").read_bytes() == before
+    assert len(finished_sets(tmp_path / "scene" / "windows")) == 1
+
+
+def full(*_, **__) -> None:
+    raise OSError("disk full")
+
+
 def test_what_cannot_be_changed_says_why(parts, model, tmp_path) -> None:
     start(parts, tmp_path / "scene")
     here = (Renderer(), Monitor(), 4)

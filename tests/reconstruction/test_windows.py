@@ -3,8 +3,10 @@
 import itertools
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch.testing import assert_close
@@ -15,6 +17,7 @@ from vg2gt.cli import reconstruct as command
 from vg2gt.data import SyntheticScenes
 from vg2gt.geometry.alignment import align_cameras
 from vg2gt.metrics import psnr
+from vg2gt.reconstruction.given_cameras import given_pictures
 from vg2gt.reconstruction.pipeline import reconstruct_with
 from vg2gt.reconstruction.windows import run as windows_run
 from vg2gt.reconstruction.windows import store
@@ -155,12 +158,42 @@ def test_windows_are_for_many_views_overlap_and_own_every_view_once() -> None:
 def test_the_command_makes_windows_and_tiles_and_clears_up(walk, tmp_path, monkeypatch) -> None:
     out = tmp_path / "out"
     monkeypatch.setattr(command, "LARGE", 100)
-    command.main([str(walk), "--out", str(out), "--window", "6", "--quiet", "--device", "cpu", *BY_ITSELF])
+    arguments = [str(walk), "--out", str(out), "--window", "6", "--quiet", "--device", "cpu", *BY_ITSELF]
+    command.main(arguments)
     assert not (out / "windows").exists()
+    (out / "windows" / "mine").mkdir(parents=True)
+    command.main([*arguments, "--overwrite"])
+    assert [path.name for path in (out / "windows").iterdir()] == ["mine"]
     report = json.loads((out / "report.json").read_text())
     assert report["views"] == VIEWS
     assert json.loads((out / "tiles" / "index.json").read_text())["gaussians"] == report["gaussians"]
     assert "windows" in report["seconds"]
+
+
+def test_windows_of_other_cameras_or_content_are_not_reused(model, walk, tmp_path) -> None:
+    pictures = given_pictures(walk, depth=True)
+    assert pictures is not None
+    first = pictures[0]
+    clip = tmp_path / "clip.mp4"
+    clip.write_bytes(b"1")
+    others = [replace(first, pose=first.pose + 1), replace(first, intrinsics=2 * first.intrinsics)]
+    others.append(replace(first, container=clip))
+    keys = {windows_run.set_key(model, [each, *pictures[1:]], (56, 84), 4) for each in (first, *others)}
+    clip.write_bytes(b"12")
+    assert len(keys | {windows_run.set_key(model, [others[-1], *pictures[1:]], (56, 84), 4)}) == 5
+
+
+def test_windows_keep_map_coordinates(model, walk, tmp_path) -> None:
+    far = np.array([500_000.0, 4_000_000.0, 100.0])
+    poses = np.loadtxt(walk / "poses.txt").reshape(-1, 4, 4)
+    poses[:, :3, 3] += far
+    moved = shutil.copytree(walk, tmp_path / "walk")
+    np.savetxt(moved / "poses.txt", poses.reshape(len(poses), -1), fmt="%.9f")
+    scene = reconstruct_with(model, moved, window=6)
+    assert scene.frame is not None
+    assert scene.poses is not None
+    found = scene.frame.to_source @ np.linalg.inv(scene.poses.numpy())
+    np.testing.assert_allclose(found[:, :3, 3], poses[:, :3, 3], rtol=0, atol=1e-3)
 
 
 def test_a_model_without_voxels_says_so(walk) -> None:

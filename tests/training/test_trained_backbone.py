@@ -42,7 +42,10 @@ def test_a_checkpoint_holds_a_trained_backbone(tmp_path: Path, cache: Path) -> N
     loaded = load_model(tmp_path / "first").model
     assert all(torch.equal(value, stored["model." + name]) for name, value in loaded.trained_state().items())
     assert weight in loaded.trained_state()
-    again = train(small_config(tmp_path / "frozen", cache, *given, f"init_from={path}"))
+    again = train(small_config(tmp_path / "again", cache, *given, UNFROZEN, f"init_from={path}"))
     assert again["untrained"] == trained["trained"]
-    kept = read_checkpoint(newest(tmp_path / "frozen" / "checkpoints"))["state_dict"]
-    assert not any(name.startswith("model.backend.") for name in kept)
+    # a frozen backbone would be neither the trained one nor in the new checkpoints
+    with pytest.raises(ValueError, match="holds a trained backbone, but this one is frozen: set backend.freeze=false"):
+        train(small_config(tmp_path / "frozen", cache, *given, f"init_from={path}"))
+    with pytest.raises(ValueError, match="holds a trained backbone: use the same backend= with backend.freeze=false"):
+        load_model(tmp_path / "first", overrides=["backend.freeze=true"])

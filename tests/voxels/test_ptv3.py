@@ -28,6 +28,13 @@ def test_orders_are_shuffled_in_training_only_and_from_the_generator(voxels, mak
     assert torch.equal(run(0), run(1))
 
 
+def test_batch_norm_of_one_voxel_uses_the_running_statistics(voxels, make_ptv3):
+    net = make_ptv3(norm="batch").double().train()
+    features, grid, batch, size = voxels
+    one = (features[:1], grid[:1], batch[:1], size)
+    assert net(*one).isfinite().all()
+
+
 def test_drop_path_acts_in_training_only(voxels, make_ptv3):
     net = make_ptv3(drop_path=0.5).double()
     torch.manual_seed(0)

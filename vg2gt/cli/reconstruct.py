@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import logging
-import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -71,7 +70,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     from vg2gt.reconstruction.outputs import cost_figures, write_outputs
     from vg2gt.reconstruction.refined import refine_scene, refinement_lines
     from vg2gt.reconstruction.trust import trust_line, trusted
-    from vg2gt.reconstruction.windows.store import tidy
+    from vg2gt.reconstruction.windows.store import remove, tidy
     from vg2gt.runs.load import choose_device, load_model
 
     changed = options.add or options.take_out
@@ -107,7 +106,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     if changed or options.keep_windows:
         tidy(folder / WINDOWS)
     else:
-        shutil.rmtree(folder / WINDOWS, ignore_errors=True)
+        remove(folder / WINDOWS)
     cost = cost_figures(monitor)
     times = ", ".join(f"{name} {seconds:.1f}" for name, seconds in cost["seconds"].items() if seconds >= 0.05)
     height, width = scene.cameras.size
@@ -129,6 +128,12 @@ def _check(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     from vg2gt.reconstruction.windows.store import window_size
     from vg2gt.runs.load import backend_class
 
+    if options.add or options.take_out:
+        fixed = {"--poses": options.poses != "auto", "--size": options.size, "--max-images": options.max_images}
+        fixed |= {"--calibration": options.calibration, "--drop": options.drop}
+        fixed |= {"--min-confidence": options.min_confidence is not None}
+        if useless := [name for name, given in fixed.items() if given]:
+            raise ValueError(f"{', '.join(useless)} cannot be combined with --add or --take-out: leave out")
     check_outputs(options.save)
     check_folder(options.out, options.save, options.overwrite)
     check_limit(options.max_images)

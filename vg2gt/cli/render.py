@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from pathlib import Path
 
 from vg2gt.cli.arguments import add_common_flags, flag_parser, listing
 from vg2gt.cli.errors import errors_in_one_line
@@ -28,7 +29,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     add("--depth", choices=("median", "expected"), default="median", help="expected requires --mode rasterized")
     add("--interpolate", type=int, metavar="N", help="interpolate smoothly, with N new cameras between each pair")
     add("--fps", type=float, default=FPS, help=f"frame rate of the animation, default {FPS:g}")
-    add("--near", type=float, default=0.01, help="near plane in scene units")
+    add("--near", type=float, help="near plane in scene units; default: that of report.json next to it, else 0.01")
     add_common_flags(arguments, DEFAULT)
     options = arguments.parse_args(argv)
     with errors_in_one_line():
@@ -42,6 +43,7 @@ def run(options: argparse.Namespace) -> None:
     from vg2gt.reconstruction.camera_files import interpolate, read_cameras
     from vg2gt.reconstruction.monitor import Monitor
     from vg2gt.reconstruction.outputs import animation, check_folder, check_outputs, cost_figures, feed, map_folder
+    from vg2gt.reconstruction.saved import near_of
     from vg2gt.reconstruction.scene import render_views
     from vg2gt.rendering import Renderer
     from vg2gt.runs.load import choose_device
@@ -57,7 +59,11 @@ def run(options: argparse.Namespace) -> None:
     gaussians = read_gaussians(options.scene).to(choose_device(options.device))
     if not len(gaussians):
         raise ValueError(f"{options.scene} holds no Gaussians; there is nothing to render")
-    renderer = Renderer(mode=options.mode, depth=options.depth, near=options.near)
+    renderer = Renderer(
+        mode=options.mode,
+        depth=options.depth,
+        near=near_of(Path(options.scene).parent) if options.near is None else options.near,
+    )
     folder = check_folder(options.out, outputs, options.overwrite)
     folder.mkdir(parents=True, exist_ok=True)
     sinks = [map_folder(folder, name) for name in outputs if name in MAPS]

@@ -26,11 +26,15 @@ SHARES = 20  # steps of the sparsification curve
 def image_metrics(rendered: Render, truth: Batch, lpips: LPIPS | None = None) -> dict[str, float]:
     """``psnr``, ``ssim`` and, if a network is given, ``lpips`` of one scene, averaged over its views.
 
-    Masked pixels count as correct, as in the loss.
+    Masked pixels count as correct, as in the loss; views without any other pixel do not count.
     """
     images, color = truth.images[0], rendered.color[0]
     if truth.mask is not None:
-        color = torch.lerp(images, color, truth.mask[0, :, None])
+        counts = truth.mask[0].flatten(1).any(1)  # [V]
+        if not counts.any():
+            return {}
+        color = torch.lerp(images, color, truth.mask[0, :, None])[counts]
+        images = images[counts]
     found = {"psnr": float(psnr(color, images).mean()), "ssim": float(ssim(color, images).mean())}
     if lpips is not None:
         found["lpips"] = float(lpips(color, images).mean())

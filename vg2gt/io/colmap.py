@@ -98,6 +98,8 @@ def read_colmap(folder: str | Path) -> Reconstruction:
                 _check_records(name, files[name])
         try:
             model = pycolmap.Reconstruction(temporary)
+            if ending == ".txt":
+                _restore_names(model, files["images"])
             senseless = _senseless(model)
         except (ValueError, IndexError, KeyError, RuntimeError, MemoryError) as error:
             texts = {path: path.read_text(errors="replace") for path in files.values() if path.suffix == ".txt"}
@@ -109,6 +111,16 @@ def read_colmap(folder: str | Path) -> Reconstruction:
             what = f"number {numbers[0]} has values that are not finite or make no sense"
             raise FormatError(f"{files[name]}: {what}; correct or remove it, or export the model again")
     return model
+
+
+def _restore_names(model: Reconstruction, file: Path) -> None:
+    """Sets the names of images from ``images.txt``; pycolmap's reader ends them at the first space."""
+    lines = iter(file.read_text(errors="surrogateescape").splitlines())
+    for line in lines:
+        fields = line.split(maxsplit=9)
+        if len(fields) == 10 and not line.startswith("#"):
+            model.images[int(fields[0])].name = fields[9].strip()
+            next(lines, None)  # its points
 
 
 def write_colmap(folder: str | Path, model: Reconstruction) -> Path:

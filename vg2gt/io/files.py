@@ -110,9 +110,11 @@ def whole_folder(target: Path) -> Iterator[Path]:
     staged.mkdir(parents=True)
     try:
         yield staged
+        before = temporary_name(target)
         if target.exists():
-            shutil.rmtree(target)
+            os.replace(target, before)
         os.replace(staged, target)
+        shutil.rmtree(before, ignore_errors=True)
     finally:
         shutil.rmtree(staged, ignore_errors=True)
 

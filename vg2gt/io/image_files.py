@@ -115,16 +115,18 @@ def read_mask(
         The mask; None if all pixels count, as in a photograph without transparency.
     """
     with _opened(path, scene, content) as image:
-        grey = not has_alpha(image)
+        grey, labels = not has_alpha(image), image.mode == "P"  # the colours of labels can be dark
         if grey and not is_mask:
             return None
+        if is_mask and not grey and np.asarray(image.convert("RGBA").getchannel("A")).min(initial=255) == 255:
+            image, grey = image.convert("RGB"), True  # an opaque alpha says nothing
         if grey:
             plane = image if image.mode in ("I", "I;16") else image.convert("L")
         else:
             plane = image.convert("RGBA").getchannel("A")
         values = np.array(_turned(plane, _orientation(image) if upright else 1), np.float32)
     highest = values.max(initial=0)
-    largest = 1 if grey and highest == 1 else 255 if highest <= 255 else 65535
+    largest = highest if labels and highest else 1 if grey and highest == 1 else 255 if highest <= 255 else 65535
     return None if values.min(initial=largest) >= largest else (values / largest).astype(np.float32)
 
 

@@ -102,12 +102,20 @@ def write_mesh(path: str | Path, mesh: Mesh) -> Path:
         raise ValueError(f"{path}: a mesh is written as one of {', '.join(SUFFIXES)}")
     if not len(mesh.faces):
         raise ValueError("the mesh is empty: no valid depth, or voxels larger than the surfaces; check both")
-    body = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.colors, process=False)
-    if path.suffix.lower() == ".glb":
+    in_gltf = path.suffix.lower() == ".glb"
+    colors = _linear(mesh.colors) if in_gltf else mesh.colors
+    body = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colors, process=False)
+    if in_gltf:
         body.apply_transform(np.diag([1.0, -1.0, -1.0, 1.0]))  # glTF has y up, our world has y down
     content = body.export(file_type=path.suffix[1:].lower())
     assert isinstance(content, bytes)
     return write_bytes(path, content)
+
+
+def _linear(colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Converts sRGB to linear colours, which glTF's vertices have."""
+    share = colors / 255
+    return (255 * np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4) + 0.5).astype(np.uint8)
 
 
 def _check(depth: Tensor, cameras: Cameras, colors: Tensor, voxel_size: float) -> None:

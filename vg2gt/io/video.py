@@ -25,6 +25,7 @@ from vg2gt.io.files import replacing, write_bytes
 if TYPE_CHECKING:
     from av import VideoFrame  # optional
     from av.container import InputContainer
+    from av.packet import Packet
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".gif")
 _QUALITY = "18"  # constant rate factor of H.264: 0 is lossless, 23 is x264's default
@@ -42,7 +43,7 @@ def count_frames(path: str | Path) -> int:
         ImportError: if PyAV is not installed.
     """
     with _opened(path) as container:
-        return sum(packet.size > 0 for packet in container.demux(video=0))  # the last packet is empty
+        return sum(_shown(packet) for packet in container.demux(video=0))
 
 
 def read_video(path: str | Path, every: int = 1) -> Iterator[tuple[int, NDArray[np.uint8]]]:
@@ -121,11 +122,16 @@ def video_size(path: str | Path) -> tuple[int, int]:
     return height, width
 
 
+def _shown(packet: Packet) -> bool:
+    """Returns whether a packet holds a frame to show: not the empty last one, nor what a trimmed video skips."""
+    return packet.size > 0 and not packet.is_discard
+
+
 @lru_cache(maxsize=8)
 def _frame_times(path: str | Path, state: int) -> list[int]:
     """Sorted presentation times of all frames; a new ``state`` invalidates the cache when the file changes."""
     with _opened(path) as container:
-        return sorted(packet.pts for packet in container.demux(video=0) if packet.size and packet.pts is not None)
+        return sorted(packet.pts for packet in container.demux(video=0) if _shown(packet) and packet.pts is not None)
 
 
 def write_video(path: str | Path, frames: Sequence[NDArray[np.uint8]], fps: float = 24.0) -> Path:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from vg2gt.geometry.precision import full_precision
 from vg2gt.geometry.rotations import matrix_to_quat, multiply_quats
 from vg2gt.geometry.spherical_harmonics import MAX_DEGREE, rgb_to_sh
 from vg2gt.memory import Cap, note_sizes
@@ -93,6 +94,10 @@ class GaussianHead(nn.Module):
         """
         # features [M, C] to K sets of raw parameters: [M, K, ...]
         raw = self.out(F.gelu(self.hidden(voxels.features))).float().unflatten(-1, (self.splits, -1))
+        with full_precision(raw):  # geometry
+            return self._gaussians(raw, voxels)
+
+    def _gaussians(self, raw: Tensor, voxels: Voxels) -> Gaussians:
         offset, scale, rotation, opacity, color = raw.split(self.parts, -1)
         size = voxels.voxel_size[voxels.batch][:, None, None]
         anchor = voxels.centroid if self.anchor == "centroid" else voxels.centers

@@ -367,4 +367,12 @@ def _ramp(largest: float, depths: Sequence[int]) -> list[list[float]]:
 
 def _make_norm(kind: Norm, channels: int) -> nn.Module:
     check_choice("ptv3.norm", kind, Norm)
-    return nn.BatchNorm1d(channels, eps=1e-3, momentum=0.01) if kind == "batch" else nn.LayerNorm(channels)
+    return _BatchNorm(channels, eps=1e-3, momentum=0.01) if kind == "batch" else nn.LayerNorm(channels)
+
+
+class _BatchNorm(nn.BatchNorm1d):
+    def forward(self, input: Tensor) -> Tensor:
+        """Normalises ``[N, C]``; a single row has no variance and is normalised by the running statistics."""
+        if len(input) > 1:
+            return super().forward(input)
+        return F.batch_norm(input, self.running_mean, self.running_var, self.weight, self.bias, eps=self.eps)

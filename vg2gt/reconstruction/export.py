@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from vg2gt.geometry.cameras import project
 from vg2gt.io.files import write_bytes
-from vg2gt.io.image_files import orientation
+from vg2gt.io.image_files import image_size, orientation
 from vg2gt.io.images import encode_image, to_pixels
 from vg2gt.types import Cameras
 
@@ -51,8 +51,9 @@ class ExportedViews:
         for name, picture, image in zip(self.names, self.pictures, scene.images, strict=True):
             path = folder / name
             if picture is not None:
-                if picture.path is not None and not picture.lens and orientation(picture.path, "") == 1:
-                    shutil.copyfile(picture.path, path)
+                file = None if picture.lens else picture.path
+                if file is not None and orientation(file, "") == 1 and image_size(file, "") == picture.size:
+                    shutil.copyfile(file, path)
                     continue
                 image = picture.read(picture.size).images[0]
             is_jpeg = path.suffix.lower() in (".jpg", ".jpeg")

@@ -88,8 +88,9 @@ def recording_pictures(source: FileSource) -> list[Picture]:
         raise ValueError(f"there are {len(source.scenes)} recordings; give one of them: {', '.join(source.scenes)}")
     scene = source.scenes[0]
     index = source.scene_index(scene)
-    kind = f"{type(source).__name__} {index.folder}"
     metric = source.is_metric or (isinstance(source, RGBDFolder) and (index.folder / "depth").is_dir())
+    recorded = metric or not isinstance(source, RGBDFolder) or app_of(index.folder) is not None
+    kind = f"{type(source).__name__ if recorded else 'poses'} {index.folder}"
 
     def picture(frame: int) -> Picture:
         """Returns a frame as a picture that is read on demand."""
@@ -108,6 +109,7 @@ def recording_pictures(source: FileSource) -> list[Picture]:
             source.point_depths(scene, frame) if isinstance(source, COLMAP) else None,
             path=color if color.is_file() and color.suffix.lower() in IMAGE_SUFFIXES else None,
             pose=index.world_to_camera[row],
+            intrinsics=index.intrinsics[row],
             is_metric=metric,
             lens=index.lens(row),
         )
@@ -146,15 +148,25 @@ def _given(folder: Path, depth: bool) -> list[Picture] | None:
     if folder.is_dir():
         places.append((folder.resolve().parent, folder.resolve().name))
     for place, images in places:
-        pictures = None
+        pictures, above = None, place == folder.resolve().parent and place != folder
+        if above and (app_of(place) is not None or any(place.glob(f"*{R3D}"))):
+            continue  # a recording next to a folder of photographs is not of them
         if not depth and (place / _CAMERAS).is_file():
             pictures = _from_cameras_json(place / _CAMERAS, place / images)
         if pictures is None and (source := _source(place, images, depth)) is not None:
             pictures = recording_pictures(source)
+        if pictures is not None and above:  # the cameras may be those of other folders
+            inside_it = [picture for picture in pictures if picture.path and folder.resolve() in _folders(picture.path)]
+            pictures = inside_it or None
         if pictures is not None:
             _name_missing(pictures, place / images)
             return pictures
     return None
+
+
+def _folders(path: Path) -> set[Path]:
+    """Returns the folders that a file is in, by its own path and with links followed."""
+    return {*path.absolute().parents, *path.resolve().parents}
 
 
 def _source(folder: Path, images: str, depth: bool) -> FileSource | None:
@@ -230,7 +242,7 @@ def _photo(path: Path, camera: NamedCamera, cameras: Path) -> Picture:
         photo = Photo(path.name, camera.width, camera.height, camera.intrinsics)
     undistortion = undistortion_of(photo.lens) if photo.lens else None
     expected = undistortion.lens_size if undistortion else (photo.height, photo.width)
-    size, upright = size_on_disk(path, path.parent.name, expected, str(cameras))
+    size, upright = size_on_disk(path, path.parent.name, expected, str(cameras), as_stored=False)
     intrinsics = torch.from_numpy(photo.intrinsics)
     pose = torch.from_numpy(camera.world_to_camera)
 
@@ -253,6 +265,7 @@ def _photo(path: Path, camera: NamedCamera, cameras: Path) -> Picture:
         f"{_CAMERAS} {cameras.parent}",
         path=path,
         pose=camera.world_to_camera,
+        intrinsics=photo.intrinsics,
         is_metric=camera.metres_per_unit == 1,
         lens=photo.lens,
     )

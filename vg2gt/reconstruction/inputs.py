@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -101,7 +102,7 @@ def load_views(pictures: Sequence[Picture], size: tuple[int, int], monitor: Moni
     mask = None if joined.mask is None else joined.mask[None]
     source, hints = source_of(pictures), Hints(frame_ids=torch.arange(len(pictures))[None], mask=mask)
     if source:
-        cameras = Cameras(given_poses(pictures)[None], joined.intrinsics[None], size)
+        cameras = Cameras(given_poses(pictures, map_shift(pictures))[None], joined.intrinsics[None], size)
         depth = joined.depth[None] if all(picture.has_depth for picture in pictures) else None
         hints = Hints(depth, cameras, (source,), hints.frame_ids, depth_range(pictures), mask)
     return Views(joined.images, tuple(picture.name for picture in pictures), hints, joined.mask)
@@ -135,13 +136,22 @@ def source_of(pictures: Sequence[Picture]) -> str:
     return sources.pop()
 
 
-def given_poses(pictures: Sequence[Picture]) -> Tensor:
-    """Returns given poses ``[V, 4, 4]``; map coordinates too large for float32 are shifted to the first camera."""
-    poses = np.stack([np.eye(4) if picture.pose is None else picture.pose for picture in pictures])
+def map_shift(pictures: Sequence[Picture]) -> NDArray[np.float64]:
+    """Returns the translation ``[4, 4]`` to the first camera if map coordinates are too large for float32, else I."""
+    poses = _poses(pictures)
     shift = np.eye(4)
     shift[:3, 3] = -poses[0, :3, :3].T @ poses[0, :3, 3]
     far = np.abs(poses[:, :3, 3]).max() > 1e3 * np.abs((poses @ shift)[:, :3, 3]).max()
-    return torch.from_numpy(poses @ shift if far else poses).float()
+    return shift if far else np.eye(4)
+
+
+def given_poses(pictures: Sequence[Picture], shift: NDArray[np.float64]) -> Tensor:
+    """Returns given poses ``[V, 4, 4]`` in the world that ``shift [4, 4]`` (:func:`map_shift`) maps to their own."""
+    return torch.from_numpy(_poses(pictures) @ shift).float()
+
+
+def _poses(pictures: Sequence[Picture]) -> NDArray[np.float64]:
+    return np.stack([np.eye(4) if picture.pose is None else picture.pose for picture in pictures])
 
 
 def depth_range(pictures: Sequence[Picture]) -> Tensor | None:

@@ -137,6 +137,7 @@ def scene_figures(scene: Scene) -> dict[str, Any]:
         "gaussians": len(scene.gaussians),
         "metres_per_unit": scene.metres_per_unit,
         "mode": scene.renderer.mode,
+        "near": scene.renderer.near,
         **refinement_figures(scene),
         **trust_figures(scene),
         "cameras": scene.cameras_from or PREDICTED,

@@ -6,7 +6,6 @@ import hashlib
 import importlib.util
 import itertools
 import logging
-import math
 import re
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -59,6 +58,8 @@ class Picture:
         focal: focal length in pixels from EXIF; None if unknown.
         path: its file; None if it has no file of its own.
         pose: ``[4, 4]`` float64 given ``world_to_camera``; None if there is none.
+        intrinsics: ``[3, 3]`` float64 given intrinsics, at the size of its camera; None if there are none.
+        container: the video that it is a frame of; None: no video.
         is_metric: whether its camera (and depth) is in metres.
         lens: lens that its file was undistorted from (``undistortion.lens_text``); empty for a pinhole image.
     """
@@ -72,6 +73,8 @@ class Picture:
     focal: float | None = None
     path: Path | None = None
     pose: NDArray[np.float64] | None = None
+    intrinsics: NDArray[np.float64] | None = None
+    container: Path | None = None
     is_metric: bool = False
     lens: str = ""
 
@@ -149,9 +152,16 @@ def existing_path(item: str | Path) -> Path:
 
 
 def shrunk(pixels: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
-    """Averages blocks of an image ``[H, W, 3]`` of at least 4 times ``size``, to no less than twice ``size``."""
+    """Reduces an image ``[H, W, 3]`` of at least 4 times ``size`` to no less than about twice ``size``."""
     factor = min(pixels.shape[0] // size[0], pixels.shape[1] // size[1]) // 2
-    return pixels if factor < 2 else np.array(Image.fromarray(pixels).reduce(factor))
+    if factor < 2:
+        return pixels
+    height, width = pixels.shape[:2]
+    image = Image.fromarray(pixels)
+    if height % factor or width % factor:  # the last blocks would be incomplete, and the camera would not fit
+        size = (round(width / factor), round(height / factor))
+        return np.array(image.resize(size, Image.Resampling.HAMMING))
+    return np.array(image.reduce(factor))
 
 
 def frame_of(pixels: NDArray[np.uint8], mask: NDArray[np.float32] | None = None) -> Frames:
@@ -247,7 +257,7 @@ def _photo(path: Path, content_of: Callable[[Path], bytes | None] = lambda _: No
 
 def _video(path: Path, limit: int) -> list[Picture]:
     count = count_frames(path)
-    every = max(1, math.ceil(count / limit))
+    every = max(1, count // limit)
     if count > IN_MEMORY * every:
         size, frames = video_size(path), VideoFrames(path, every)
 
@@ -255,8 +265,10 @@ def _video(path: Path, limit: int) -> list[Picture]:
             name = f"{path.stem}-{number:06d}"
             return Picture(name, size, lambda wanted: frame_of(shrunk(frames.read(number), wanted)))
 
-        return [picture(number) for number in range(0, count, every)]
-    return [_in_memory(f"{path.stem}-{number:06d}", pixels) for number, pixels in read_video(path, every)]
+        found = [picture(number) for number in range(0, count, every)]
+    else:
+        found = [_in_memory(f"{path.stem}-{number:06d}", pixels) for number, pixels in read_video(path, every)]
+    return [replace(each, container=path) for each in evenly(found, limit)]
 
 
 def _in_memory(name: str, pixels: NDArray[np.uint8], mask: NDArray[np.float32] | None = None) -> Picture:
@@ -296,10 +308,11 @@ def with_unique_names(pictures: Sequence[Picture]) -> list[Picture]:
     """Returns the pictures with a number appended to names that occur more than once."""
     counts = Counter(picture.name for picture in pictures)
     numbers = {name: itertools.count() for name, count in counts.items() if count > 1}
-    return [
-        replace(each, name=f"{each.name}-{next(numbers[each.name]):03d}") if each.name in numbers else each
-        for each in pictures
-    ]
+
+    def unused(name: str) -> str:
+        return next(new for number in numbers[name] if (new := f"{name}-{number:03d}") not in counts)
+
+    return [replace(each, name=unused(each.name)) if each.name in numbers else each for each in pictures]
 
 
 def without_copies(pictures: Sequence[Picture]) -> list[Picture]:

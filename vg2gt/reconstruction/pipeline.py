@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -29,7 +28,16 @@ from vg2gt.reconstruction.saved import read_scene
 from vg2gt.reconstruction.scene import Scene
 from vg2gt.reconstruction.trust import pixel_trust
 from vg2gt.reconstruction.windows.run import WindowRun, device_of, gaussians_of, set_key, window_model
-from vg2gt.reconstruction.windows.store import AUTOMATIC, Anchor, finished_sets, key_of, read_anchor, window_size
+from vg2gt.reconstruction.windows.store import (
+    AUTOMATIC,
+    Anchor,
+    finished_sets,
+    key_of,
+    mark_taken_out,
+    read_anchor,
+    was_taken_out,
+    window_size,
+)
 from vg2gt.rendering import Renderer
 from vg2gt.runs.load import load_model
 from vg2gt.types import Cameras, Gaussians, Geometry
@@ -241,7 +249,7 @@ def take_out(
         names = {picture.name for picture in pictures}
         size = window_size(window, len(pictures), kept=True)
         place = kept / set_key(model, pictures, anchor.size, size, anchor)[:12]
-    if place not in finished_sets(kept):
+    if place not in finished_sets(kept) and not was_taken_out(place):
         raise ValueError("these images were not added by one command: give the same folder and the same --window")
     left = [view for view, name in enumerate(old.names) if name not in names]
     if not left:
@@ -249,7 +257,7 @@ def take_out(
     gaussians = gaussians_of(model, kept, anchor, monitor, left_out=place)
     moved = similarity_of(anchor.to_source).apply_gaussians(gaussians)
     scene = replace(_with_views(old, left), gaussians=moved)
-    shutil.rmtree(place)
+    mark_taken_out(place)
     return scene if model.visibility is None else with_far_shell(scene)
 
 

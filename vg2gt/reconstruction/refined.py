@@ -11,6 +11,8 @@ from vg2gt.reconstruction.monitor import Monitor
 from vg2gt.refinement import Observations, RefineOptions, refine
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from vg2gt.reconstruction.scene import Scene
 
 RECORDINGS = ("RGBDFolder", "TUM")  # their measured poses fit their depth better than bundle adjustment does
@@ -64,8 +66,13 @@ def refinement_figures(scene: Scene) -> dict[str, Any]:
         figures[f"gaussians_{when}"] = len(state.gaussians)
         for name, views in (("trained", refined.trained), ("held_out", refined.held_out)):
             if len(views):
-                figures[f"psnr_{name}_{when}"] = round(float(psnr[views].mean()), 3)
+                figures[f"psnr_{name}_{when}"] = round(_mean(psnr[views]), 3)
     return {"refinement": figures}
+
+
+def _mean(psnr: Tensor) -> float:
+    """Returns the mean over the views of which not all pixels are masked."""
+    return float(psnr[psnr.isfinite()].mean()) if psnr.isfinite().any() else 0.0
 
 
 def refinement_lines(scene: Scene) -> list[str]:
@@ -75,7 +82,7 @@ def refinement_lines(scene: Scene) -> list[str]:
         return lines
     for name, views in (("trained on", refined.trained), ("held out", refined.held_out)):
         if len(views):
-            before, after = refined.psnr[:, views].mean(1).tolist()
+            before, after = (_mean(psnr[views]) for psnr in refined.psnr)
             lines.append(f"{name:<11} {len(views):>4} views: {before:6.2f} -> {after:6.2f} dB")
     before, after = len(refined.start.gaussians), len(refined.scene.gaussians)
     ended = {"interrupted": ", interrupted", "diverged": ", stopped because it diverged"}.get(refined.ended, "")

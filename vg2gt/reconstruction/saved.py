@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,9 @@ from vg2gt.rendering import Renderer
 from vg2gt.types import Cameras
 
 NEEDED, KNOWN = ("images", "depth", "depth_conf"), ("names", "mask", "error", "support")
+
+
+DEFAULT_NEAR = Renderer().near
 
 
 def read_scene(folder: str | Path, renderer: Renderer, device: torch.device | str = "cpu") -> Scene:
@@ -57,12 +61,18 @@ def read_scene(folder: str | Path, renderer: Renderer, device: torch.device | st
         cameras=Cameras(poses.float()[None], intrinsics.float()[None], sizes[0]).to(device),
         **_read_views(folder / "views.npz", named, sizes[0]),
         names=tuple(view_stem(camera.name) for camera in named),
-        renderer=renderer,
+        renderer=replace(renderer, near=near_of(folder)),
         metres_per_unit=report.get("metres_per_unit") if metres is None else metres,
         cameras_from="" if cameras_from == PREDICTED else cameras_from,
         frame=None if similarity is None else SceneFrame(frame, similarity, None, frame),
         poses=poses,
     )
+
+
+def near_of(folder: Path) -> float:
+    """Returns the near plane of the scene in a folder, from ``report.json`` if there is one."""
+    file = folder / "report.json"
+    return float(read_json(file).get("near", DEFAULT_NEAR)) if file.is_file() else DEFAULT_NEAR
 
 
 def _read_views(path: Path, named: list[NamedCamera], size: tuple[int, int]) -> dict[str, Any]:

@@ -145,12 +145,15 @@ def initialize_from(module: nn.Module, path: str | Path) -> None:
     """Initialises a Lightning module from trained weights; layers that do not fit keep their values and are logged.
 
     Raises:
-        ValueError: if no tensor of the checkpoint fits the module, or one is not finite.
+        ValueError: if no tensor of the checkpoint fits the module, one is not finite, or it would change a frozen one.
     """
     stored: Mapping[str, Tensor] = read_checkpoint(path).get("state_dict", {})
     refuse_not_finite(stored, path)
     present = {k: v for k, v in module.state_dict().items() if k in stored or not k.startswith("model.backend.")}
     fitting = {k: v for k, v in stored.items() if k in present and present[k].shape == v.shape}
+    frozen = {name for name, value in module.named_parameters() if not value.requires_grad}
+    if any(not torch.equal(present[name].cpu(), fitting[name].cpu()) for name in frozen & fitting.keys()):
+        raise ValueError(f"init_from={path} holds a trained backbone, but this one is frozen: set backend.freeze=false")
     if not fitting:
         raise ValueError(f"init_from={path}: none of its {len(stored)} tensors matches this model")
     nn.Module.load_state_dict(module, fitting, strict=False)

@@ -4,8 +4,11 @@ import logging
 
 import pytest
 
+from tests.io.test_colmap import small_model
 from vg2gt.data import DataError, RGBDFolder, SyntheticScenes
 from vg2gt.data.sources import files
+from vg2gt.data.sources.colmap_model import COLMAP
+from vg2gt.io import write_colmap
 
 from .layout_rgbd import write_recording
 from .layouts import room
@@ -57,6 +60,14 @@ def test_a_cache_that_cannot_be_written_is_told_once(dataset, tmp_path, caplog):
         rooms = SyntheticScenes(2, num_frames=1, size=(14, 14), cache_dir=str(tmp_path / "cache"))
         assert rooms.load("room-000000", [0]).depth.shape == (1, 14, 14)
     assert sum("is disabled, because" in record.getMessage() for record in caplog.records) == 1
+
+
+def test_a_part_of_a_scene_is_no_scene(tmp_path) -> None:
+    for place in ("garden", "garden/dense", "house/room"):
+        for name in ("images", "sparse/0"):
+            (tmp_path / place / name).mkdir(parents=True, exist_ok=True)
+        write_colmap(tmp_path / place / "sparse" / "0", small_model())
+    assert list(COLMAP(str(tmp_path)).scenes) == ["garden", "house/room"]
 
 
 def test_every_second_frame(dataset):

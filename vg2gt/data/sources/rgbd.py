@@ -27,7 +27,10 @@ from typing_extensions import Unpack
 from vg2gt.data.base import DataError
 from vg2gt.data.sources.files import FileOptions, FileSource
 from vg2gt.data.sources.index import SceneIndex, check_found, first_size, make_index
+from vg2gt.data.sources.masks import FOLDER as MASKS
+from vg2gt.data.sources.masks import joined_masks, mask_of
 from vg2gt.data.sources.parsing import (
+    IMAGE_SUFFIXES,
     check_intrinsics,
     errors_name,
     four_intrinsics,
@@ -40,7 +43,7 @@ from vg2gt.data.sources.parsing import (
 )
 from vg2gt.data.sources.phone import PACKED, VIDEO, Recording, app_of, read_metres
 from vg2gt.geometry.cameras import resize_intrinsics
-from vg2gt.io.image_files import Size, check_size, read_color, read_depth
+from vg2gt.io.image_files import Size, check_size, read_color, read_depth, read_mask, read_mask_file
 from vg2gt.io.record3d import R3D, is_archive, read_recorded
 from vg2gt.io.video import read_frame
 
@@ -141,6 +144,15 @@ class RGBDFolder(FileSource):
             pixels = read_frame(path, index.frame_ids[row])
         check_size(path, index.name, pixels.shape[:2], index.color_size)
         return pixels
+
+    def read_mask(self, index: SceneIndex, row: int) -> NDArray[np.float32] | None:
+        """Reads the pixel weights from alpha and from ``masks/`` in the images' folder or next to it; None: all 1."""
+        color = index.color[row]
+        if color.suffix.lower() not in IMAGE_SUFFIXES or not color.is_file():  # a part of a video or an archive
+            return None
+        files = [mask_of(place / MASKS, color.name) for place in (color.parent, color.parent.parent)]
+        masks = [read_mask_file(file, index.name) for file in files if file is not None]
+        return joined_masks([read_mask(color, index.name), *masks[:1]])
 
     def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
         """Decodes depth: floats in metres, or integers in units of ``depth_scale``; 0 where the confidence is 0."""

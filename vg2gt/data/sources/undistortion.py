@@ -124,26 +124,27 @@ def _places(camera: Camera, intrinsics: NDArray[np.float64], size: Size) -> NDAr
     return fine[0].permute(1, 2, 0).float().contiguous().numpy()
 
 
-def size_on_disk(path: Path, scene: str, expected: Size, where: str) -> tuple[Size, bool]:
+def size_on_disk(path: Path, scene: str, expected: Size, where: str, as_stored: bool = True) -> tuple[Size, bool]:
     """Returns an image's ``(height, width)``, and whether it must be rotated upright according to its EXIF data.
 
-    The camera may belong to the image as stored or to the upright one. The aspect ratio decides; if both match, the
-    upright one is used.
+    The camera may belong to the image as stored or to the upright one. The aspect ratio decides; if both match,
+    ``as_stored`` does.
 
     Args:
         path: the image.
         scene: its scene, for messages.
         expected: ``(height, width)`` of its camera; the image may be resized.
         where: source of the camera, for the message.
+        as_stored: use the stored image, as COLMAP does; False: the upright one, as our own files do.
 
     Raises:
         DataError: if neither orientation has the camera's aspect ratio.
     """
     stored, upright = image_size(path, scene), image_size(path, scene, upright=True)
-    if orientation(path, scene) != 1 and _has_shape(upright, expected):
-        return upright, True
-    if _has_shape(stored, expected):
-        return stored, False
+    choices = [(stored, False)] if orientation(path, scene) == 1 else [(stored, False), (upright, True)]
+    for size, turned in choices if as_stored else reversed(choices):
+        if _has_shape(size, expected):
+            return size, turned
     raise DataError(
         f"{path} is {stored[1]}x{stored[0]} pixels, but its camera in {where} is {expected[1]}x{expected[0]}: use the "
         "camera's own image or a resized copy with the same aspect ratio"

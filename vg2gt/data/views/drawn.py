@@ -1,7 +1,7 @@
 """Evaluation views, drawn from a seed or read from an index file.
 
 All datasets of the paper are sequences, so views are drawn from a limited range of consecutive frames (paper, appendix
-A.2). A draw depends only on the seed, the scene's name, its frames and the number of views. An index is a JSON file
+A.1.2). A draw depends only on the seed, the scene's name, its frames and the number of views. An index is a JSON file
 with the frame ids of a draw, so that results stay reproducible if the sampling code changes. The packaged index of DTU
 holds the paper's three fixed views.
 """

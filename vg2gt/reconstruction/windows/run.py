@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -23,7 +23,7 @@ from vg2gt.method.grid import scene_voxel_size
 from vg2gt.model import VG2GT, Reconstructor, background_sums
 from vg2gt.reconstruction.inputs import thumbnails, working_order
 from vg2gt.reconstruction.monitor import Monitor
-from vg2gt.reconstruction.pictures import Picture
+from vg2gt.reconstruction.pictures import Picture, mask_file
 from vg2gt.reconstruction.windows.placement import (
     Found,
     closes,
@@ -98,7 +98,7 @@ class WindowRun:
         self.fine = cast(FineModule, model.fine)
         self.device = device_of(model)
         self.store = WindowStore(folder, set_key(model, pictures, size, window, anchor))
-        self.capture = Capture(self.store, pictures, size, monitor)
+        self.capture = Capture(self.store, pictures, size, monitor, None if anchor is None else anchor.shift)
         self.windows = cut(len(pictures), window)
         self.blocks = [each.own for each in self.windows]
         shape = (self.count, *size)
@@ -126,7 +126,8 @@ class WindowRun:
         # visibility check, fine voxels of each window, Gaussians of all windows
         size = self._check(geometry)
         if anchor is None:
-            anchor = Anchor(reference.double().numpy(), float(unit), float(size), self.capture.size, key_of(self.model))
+            numbers, model = (float(unit), float(size)), key_of(self.model)
+            anchor = Anchor(reference.double().numpy(), *numbers, self.capture.size, model, self.capture.shift)
             for other in finished_sets(self.folder):
                 if other != self.store.folder:
                     shutil.rmtree(other)
@@ -293,12 +294,17 @@ def set_key(
     model: VG2GT, pictures: Sequence[Picture], size: tuple[int, int], window: int, anchor: Anchor | None = None
 ) -> str:
     """Returns the key of a set of pictures for this model, working and window size, and anchor of a scene."""
-    states = [None if picture.path is None else picture.path.stat() for picture in pictures]
-    files = [
-        [picture.name, picture.size, picture.source, *([] if state is None else [state.st_size, state.st_mtime_ns])]
-        for picture, state in zip(pictures, states, strict=True)
-    ]
-    return key_of(model, files, size, window, None if anchor is None else anchor.plain())
+    return key_of(model, [_facts(each) for each in pictures], size, window, None if anchor is None else anchor.plain())
+
+
+def _facts(picture: Picture) -> list[Any]:
+    """Returns what identifies a picture's content and camera, as JSON values."""
+    path = picture.path
+    files = [path, None if path is None else mask_file(path), picture.container]
+    states = [file.stat() for file in files if file is not None]
+    matrices = [None if each is None else each.tolist() for each in (picture.pose, picture.intrinsics)]
+    stamps = [[state.st_size, state.st_mtime_ns] for state in states]
+    return [picture.name, picture.size, picture.source, picture.lens, matrices, stamps]
 
 
 def _summary(views: Tensor, tokens: Tokens, geometry: Geometry) -> dict[str, Tensor]:

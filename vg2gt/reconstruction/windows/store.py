@@ -27,12 +27,12 @@ from vg2gt.io.files import read_json, replacing, write_json
 from vg2gt.io.tensors import read_tensors
 from vg2gt.method.pooled import PooledVoxels, concatenate, merge
 from vg2gt.model import Reconstructor
-from vg2gt.reconstruction.inputs import depth_range, given_poses, load_views, source_of
+from vg2gt.reconstruction.inputs import depth_range, given_poses, load_views, map_shift, source_of
 from vg2gt.reconstruction.monitor import Monitor
 from vg2gt.reconstruction.pictures import Picture
 from vg2gt.types import Cameras, Hints
 
-FORMAT = 1
+FORMAT = 2
 """Version of the folder's format; increment it when the format changes."""
 SET = "set.json"  # marks the folder of a set; says whether it is finished
 ANCHOR = "scene.json"
@@ -157,11 +157,12 @@ class Anchor:
     """Data shared by all sets of a scene; created with the first set.
 
     Attributes:
-        reference: ``[4, 4]`` float64 given pose of the camera that is the frame of the voxels.
+        reference: ``[4, 4]`` float64 pose of the camera that is the frame of the voxels, in the shifted world.
         unit: scene units per unit of the given cameras.
         voxel_size: edge of the fine voxels in scene units.
         size: ``(height, width)`` of the images.
         model: key of the model.
+        shift: ``[4, 4]`` float64 translation from the shifted world to that of the given cameras (:func:`map_shift`).
     """
 
     reference: NDArray[np.float64]
@@ -169,16 +170,16 @@ class Anchor:
     voxel_size: float
     size: tuple[int, int]
     model: str
+    shift: NDArray[np.float64]
 
     @property
     def to_source(self) -> NDArray[np.float64]:
         """``[4, 4]`` similarity from the frame and unit of the voxels to those of the given cameras."""
-        matrix = np.linalg.inv(self.reference) @ np.diag([1 / self.unit, 1 / self.unit, 1 / self.unit, 1.0])
-        return matrix.astype(np.float64)
+        return self.shift @ np.linalg.inv(self.reference) @ np.diag([*[1 / self.unit] * 3, 1.0])
 
     def plain(self) -> dict[str, Any]:
         """Returns the attributes as JSON values."""
-        return vars(self) | {"reference": self.reference.tolist()}
+        return vars(self) | {"reference": self.reference.tolist(), "shift": self.shift.tolist()}
 
 
 def read_anchor(folder: Path) -> Anchor:
@@ -192,12 +193,34 @@ def read_anchor(folder: Path) -> Anchor:
             f"{folder} contains no voxels of a scene: reconstruct it with --window N --keep-windows and given cameras"
         )
     found: dict[str, Any] = read_json(folder / ANCHOR)
-    return Anchor(**found | {"reference": np.array(found["reference"]), "size": tuple(found["size"])})
+    found.update({name: np.array(found[name]) for name in ("reference", "shift")}, size=tuple(found["size"]))
+    return Anchor(**found)
 
 
 def finished_sets(folder: Path) -> list[Path]:
     """Returns the folders of the complete sets, sorted by key, which is the order of summation."""
     return sorted(path.parent for path in folder.glob(f"*/{SET}") if read_json(path).get("finished"))
+
+
+def mark_taken_out(place: Path) -> None:
+    """Marks a set as no part of the scene; :func:`tidy` removes it, once the scene without it is written."""
+    write_json(place / SET, {"finished": False, "taken_out": True})
+
+
+def was_taken_out(place: Path) -> bool:
+    """Returns whether a set is marked by :func:`mark_taken_out`."""
+    return (place / SET).is_file() and bool(read_json(place / SET).get("taken_out"))
+
+
+def remove(folder: Path) -> None:
+    """Removes all sets of a folder and the anchor, and the folder if it is empty then."""
+    sets = list(folder.glob(f"*/{SET}"))
+    for file in sets:
+        shutil.rmtree(file.parent)
+    if sets:
+        (folder / ANCHOR).unlink(missing_ok=True)
+        if not any(folder.iterdir()):
+            folder.rmdir()
 
 
 def tidy(folder: Path) -> None:
@@ -268,6 +291,7 @@ class Capture:
         pictures: source pictures, one per view.
         size: ``(height, width)`` of the images.
         monitor: shows the progress.
+        shift: see :class:`Anchor`; None: that of these pictures.
 
     Attributes:
         images: ``[V, 3, H, W]``, memory-mapped.
@@ -278,7 +302,14 @@ class Capture:
         ValueError: if a picture cannot be read.
     """
 
-    def __init__(self, store: WindowStore, pictures: Sequence[Picture], size: tuple[int, int], monitor: Monitor):
+    def __init__(
+        self,
+        store: WindowStore,
+        pictures: Sequence[Picture],
+        size: tuple[int, int],
+        monitor: Monitor,
+        shift: NDArray[np.float64] | None = None,
+    ) -> None:
         self.pictures, self.store, self.size, count = pictures, store, size, len(pictures)
         self._source = source_of(pictures)
         self.images = store.array("images", (count, 3, *size))
@@ -295,8 +326,9 @@ class Capture:
         self.mask = store.array("mask") if store.has("mask") else None
         self._depth = store.array("given_depth") if store.has("given_depth") else None
         self.given: Cameras | None = None
+        self.shift = map_shift(pictures) if shift is None else shift
         if self._source:
-            self.given = Cameras(given_poses(pictures)[None], torch.cat(intrinsics)[None], size)
+            self.given = Cameras(given_poses(pictures, self.shift)[None], torch.cat(intrinsics)[None], size)
 
     def _read(self, rows: slice, size: tuple[int, int]) -> dict[str, Tensor]:
         views = load_views(self.pictures[rows], size, Monitor())
