@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from trimesh.visual import ColorVisuals
 
 from vg2gt.geometry.cameras import ray_directions
 from vg2gt.io import fuse_depth, write_mesh
@@ -80,7 +81,7 @@ def test_written_meshes_load(tmp_path: Path, sphere, suffix: str) -> None:
     mesh.colors[:] = 188
     path = write_mesh(tmp_path / f"sphere{suffix}", mesh)
     loaded = trimesh.load_mesh(path)
-    assert isinstance(loaded.visual, trimesh.visual.ColorVisuals)
+    assert isinstance(loaded.visual, ColorVisuals)
     assert set(loaded.visual.vertex_colors[:, :3].flatten()) == {128 if suffix == ".glb" else 188}  # glTF: linear
     assert len(loaded.faces) == len(mesh.faces)
     vertices = mesh.vertices * ([1, -1, -1] if suffix == ".glb" else 1)  # glTF: y up

@@ -45,7 +45,7 @@ def test_a_checkpoint_holds_a_trained_backbone(tmp_path: Path, cache: Path) -> N
     again = train(small_config(tmp_path / "again", cache, *given, UNFROZEN, f"init_from={path}"))
     assert again["untrained"] == trained["trained"]
     # a frozen backbone would be neither the trained one nor in the new checkpoints
-    with pytest.raises(ValueError, match="holds a trained backbone, but this one is frozen: set backend.freeze=false"):
+    with pytest.raises(ValueError, match="holds a trained backbone, but this one is frozen"):
         train(small_config(tmp_path / "frozen", cache, *given, f"init_from={path}"))
-    with pytest.raises(ValueError, match="holds a trained backbone: use the same backend= with backend.freeze=false"):
+    with pytest.raises(ValueError, match=r"holds a trained backbone: use the same backend= with backend\.freeze=false"):
         load_model(tmp_path / "first", overrides=["backend.freeze=true"])
