@@ -64,8 +64,8 @@ def test_grey_photographs_are_no_masks_and_masks_may_hold_zero_and_one(tmp_path:
 def test_masks_with_an_opaque_alpha_or_dark_labels(tmp_path: Path) -> None:
     half = (np.arange(30) < 15) * np.ones((20, 1), np.uint8)
     opaque = Image.fromarray(half * 255).convert("RGBA")
-    labels = Image.fromarray(half).convert("P")
-    labels.putpalette([0, 0, 0, 128, 0, 0])
+    labels = Image.fromarray(half * np.arange(1, 31, dtype=np.uint8)).convert("P")
+    labels.putpalette([0, 0, 0] + 15 * [128, 0, 0, 0, 64, 0])
     for image in (opaque, labels):
         image.save(tmp_path / "a.png")
         assert np.array_equal(read_mask(tmp_path / "a.png", "", is_mask=True), half), image.mode

@@ -78,14 +78,22 @@ def test_cameras_are_looked_for_in_their_order(inside: bool, folder: Path, recor
 
 
 def test_cameras_next_to_a_folder_may_be_of_another(folder: Path, recording: Path, frames) -> None:
-    shutil.copytree(folder / "images", folder / "kitchen")
+    for name in ("kitchen", "images_2"):
+        shutil.copytree(folder / "images", folder / name)
     put_poses(folder, recording)
-    (folder / "scan.r3d").touch()
-    for put in (None, put_colmap, put_transforms):
+    for put in (None, put_colmap, put_transforms, put_cameras):
         if put is not None:
             put(folder, frames)
         assert given_pictures(folder / "kitchen") is None
-    (folder / "scan.r3d").unlink()
+        assert len(given_pictures(folder / "images") or []) == 4
+        assert put is None or len(given_pictures(folder / "images_2") or []) == 4
+
+
+def test_photographs_next_to_recordings_are_none_of_them(folder: Path, frames) -> None:
+    for name in ("a.r3d", "b.r3d"):
+        (folder / name).touch()
+    assert given_pictures(folder / "images") is None
+    put_colmap(folder, frames)
     assert len(given_pictures(folder / "images") or []) == 4
 
 

@@ -16,7 +16,7 @@ from vg2gt.io import read_cameras_json, read_gaussian_ply
 from vg2gt.reconstruction.monitor import Monitor
 from vg2gt.reconstruction.pipeline import add_images, take_out
 from vg2gt.reconstruction.windows.run import gaussians_of
-from vg2gt.reconstruction.windows.store import finished_sets, read_anchor
+from vg2gt.reconstruction.windows.store import finished_sets, read_anchor, tidy
 from vg2gt.rendering import Renderer
 
 SETS = 4
@@ -65,6 +65,7 @@ def test_any_order_of_adding_and_taking_out_gives_the_same_scene(parts, model, t
         scene.save(tmp_path / "next", ("scene.ply", "cameras.json", "views.npz"))
         for file in (tmp_path / "next").iterdir():
             shutil.move(file, tmp_path / "scene" / file.name)
+        tidy(kept)
         there ^= {part}
         assert len(scene.gaussians) > len(first) or not there
         assert scene.names == tuple(sorted(scene.names))
@@ -114,6 +115,8 @@ def test_taking_out_can_be_repeated_until_the_scene_is_written(parts, tmp_path, 
         patch.setattr("vg2gt.reconstruction.outputs.write_outputs", full)
         with pytest.raises(SystemExit, match="disk full"):
             command.main(["--take-out", str(tmp_path / "scene"), *rest])
+    with pytest.raises(SystemExit, match="was interrupted: repeat it first"):
+        command.main(["--add", str(tmp_path / "scene"), str(parts[2]), *rest[1:]])
     command.main(["--take-out", str(tmp_path / "scene"), *rest])
     assert (tmp_path / "scene" / "scene.ply").read_bytes() == before
     assert len(finished_sets(tmp_path / "scene" / "windows")) == 1
@@ -132,6 +135,10 @@ def test_what_cannot_be_changed_says_why(parts, model, tmp_path) -> None:
         take_out(model, tmp_path / "scene", parts[1], *here)
     with pytest.raises(ValueError, match="another model"):
         add_images(built("plain"), tmp_path / "scene", parts[1], *here)
+    anchor = tmp_path / "scene" / "windows" / "scene.json"
+    anchor.write_text(anchor.read_text().replace("shift", "moved"))
+    with pytest.raises(ValueError, match="an earlier version: reconstruct the scene again"):
+        add_images(model, tmp_path / "scene", parts[1], *here)
     shutil.rmtree(tmp_path / "scene" / "windows")
     with pytest.raises(FileNotFoundError, match="--keep-windows"):
         add_images(model, tmp_path / "scene", parts[1], *here)

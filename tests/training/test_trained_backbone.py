@@ -44,6 +44,9 @@ def test_a_checkpoint_holds_a_trained_backbone(tmp_path: Path, cache: Path) -> N
     assert weight in loaded.trained_state()
     again = train(small_config(tmp_path / "again", cache, *given, UNFROZEN, f"init_from={path}"))
     assert again["untrained"] == trained["trained"]
+    # other parts may be frozen
+    train(small_config(tmp_path / "plain", cache, *given))
+    train(small_config(tmp_path / "coarse", cache, *given, "training.part=coarse", f"init_from={tmp_path / 'plain'}"))
     # a frozen backbone would be neither the trained one nor in the new checkpoints
     with pytest.raises(ValueError, match="holds a trained backbone, but this one is frozen"):
         train(small_config(tmp_path / "frozen", cache, *given, f"init_from={path}"))

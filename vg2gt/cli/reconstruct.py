@@ -129,11 +129,11 @@ def _check(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     from vg2gt.runs.load import backend_class
 
     if options.add or options.take_out:
-        fixed = {"--poses": options.poses != "auto", "--size": options.size, "--max-images": options.max_images}
+        fixed = {"--poses sfm": options.poses == "sfm", "--size": options.size, "--max-images": options.max_images}
         fixed |= {"--calibration": options.calibration, "--drop": options.drop}
         fixed |= {"--min-confidence": options.min_confidence is not None}
         if useless := [name for name, given in fixed.items() if given]:
-            raise ValueError(f"{', '.join(useless)} cannot be combined with --add or --take-out: leave out")
+            raise ValueError(f"{', '.join(useless)} cannot be combined with --add or --take-out")
     check_outputs(options.save)
     check_folder(options.out, options.save, options.overwrite)
     check_limit(options.max_images)

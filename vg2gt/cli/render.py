@@ -59,10 +59,11 @@ def run(options: argparse.Namespace) -> None:
     gaussians = read_gaussians(options.scene).to(choose_device(options.device))
     if not len(gaussians):
         raise ValueError(f"{options.scene} holds no Gaussians; there is nothing to render")
+    near = near_of(Path(options.scene).parent, Renderer().near) if options.near is None else options.near
     renderer = Renderer(
         mode=options.mode,
         depth=options.depth,
-        near=near_of(Path(options.scene).parent) if options.near is None else options.near,
+        near=near,
     )
     folder = check_folder(options.out, outputs, options.overwrite)
     folder.mkdir(parents=True, exist_ok=True)

@@ -115,11 +115,12 @@ def read_colmap(folder: str | Path) -> Reconstruction:
 
 def _restore_names(model: Reconstruction, file: Path) -> None:
     """Sets the names of images from ``images.txt``; pycolmap's reader ends them at the first space."""
-    lines = iter(file.read_text(errors="surrogateescape").splitlines())
-    for line in lines:
-        fields = line.split(maxsplit=9)
-        if len(fields) == 10 and not line.startswith("#"):
-            model.images[int(fields[0])].name = fields[9].strip()
+    lines = iter(file.read_text(errors="replace").split("\n"))
+    for line in map(str.strip, lines):
+        if line and not line.startswith("#"):
+            number, *_, name = line.split(maxsplit=9)
+            if int(number) in model.images:
+                model.images[int(number)].name = name
             next(lines, None)  # its points
 
 

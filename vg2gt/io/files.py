@@ -106,15 +106,18 @@ def write_json(path: str | Path, content: Any) -> Path:
 @contextmanager
 def whole_folder(target: Path) -> Iterator[Path]:
     """Yields a folder to write into, which replaces ``target`` at the end of the block; on an error it is removed."""
+    target = target.resolve()  # a link stays one
     staged = temporary_name(target)
     staged.mkdir(parents=True)
     try:
         yield staged
-        before = temporary_name(target)
         if target.exists():
-            os.replace(target, before)
-        os.replace(staged, target)
-        shutil.rmtree(before, ignore_errors=True)
+            before = temporary_name(target)
+            os.replace(target, before)  # so that no time without a whole folder is lost to its removal
+            os.replace(staged, target)
+            shutil.rmtree(before)
+        else:
+            os.replace(staged, target)
     finally:
         shutil.rmtree(staged, ignore_errors=True)
 

@@ -109,13 +109,14 @@ def read_mask(
         scene: the scene it belongs to, for messages; empty: none.
         content: the encoded image if it is a part of the file; None: the whole file.
         upright: turn a photograph upright by its EXIF orientation.
-        is_mask: the file is a mask, so its brightness counts; values 0 and 1 are taken as 0 and 255.
+        is_mask: the file is a mask, so its brightness counts; values 0 and 1 are taken as 0 and 255, and
+            all colours of a palette but black as 255.
 
     Returns:
         The mask; None if all pixels count, as in a photograph without transparency.
     """
     with _opened(path, scene, content) as image:
-        grey, labels = not has_alpha(image), image.mode == "P"  # the colours of labels can be dark
+        grey, labels = not has_alpha(image), is_mask and _has_labels(image)
         if grey and not is_mask:
             return None
         if is_mask and not grey and np.asarray(image.convert("RGBA").getchannel("A")).min(initial=255) == 255:
@@ -126,8 +127,16 @@ def read_mask(
             plane = image.convert("RGBA").getchannel("A")
         values = np.array(_turned(plane, _orientation(image) if upright else 1), np.float32)
     highest = values.max(initial=0)
-    largest = highest if labels and highest else 1 if grey and highest == 1 else 255 if highest <= 255 else 65535
+    if labels:
+        values, highest = 255 * (values > 0), 255.0
+    largest = 1 if grey and highest == 1 else 255 if highest <= 255 else 65535
     return None if values.min(initial=largest) >= largest else (values / largest).astype(np.float32)
+
+
+def _has_labels(image: Image.Image) -> bool:
+    """Returns whether an image has a palette with colours, which stand for labels and can be dark."""
+    colors = np.asarray(image.convert("RGB")) if image.mode == "P" else np.zeros((1, 1, 3))
+    return bool((colors != colors[..., :1]).any())
 
 
 def read_mask_file(path: Path, scene: str, photo: Path | None = None) -> NDArray[np.float32] | None:

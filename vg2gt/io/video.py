@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from contextlib import contextmanager
 from fractions import Fraction
 from functools import lru_cache
@@ -46,12 +46,12 @@ def count_frames(path: str | Path) -> int:
         return sum(_shown(packet) for packet in container.demux(video=0))
 
 
-def read_video(path: str | Path, every: int = 1) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-    """Decodes every N-th frame of a video, turned upright by its display matrix.
+def read_video(path: str | Path, numbers: Container[int] | None = None) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+    """Decodes the frames of a video, turned upright by its display matrix.
 
     Args:
         path: the file.
-        every: N; 1 for all frames.
+        numbers: numbers of the frames to yield, from 0; None: all.
 
     Yields:
         The frame number, from 0, and the pixels ``[H, W, 3]``.
@@ -63,28 +63,28 @@ def read_video(path: str | Path, every: int = 1) -> Iterator[tuple[int, NDArray[
     number = -1
     with _opened(path) as container:
         for number, frame in enumerate(_decoded(container)):
-            if number % every == 0:
+            if numbers is None or number in numbers:
                 yield number, _upright(frame)
         if number < 0:
             raise FormatError(f"{path}: no frame of it can be decoded; it is truncated or damaged")
 
 
 class VideoFrames:
-    """Every N-th frame (N is ``every``) of a video, decoded on demand; reading in order decodes each frame once."""
+    """Some frames of a video, decoded on demand; reading in order decodes each frame once."""
 
-    def __init__(self, path: str | Path, every: int = 1) -> None:
-        self._path, self._every = path, every
-        self._rest, self._number = read_video(path, every), -1
+    def __init__(self, path: str | Path, numbers: Container[int]) -> None:
+        self._path, self._numbers = path, numbers
+        self._rest, self._number = read_video(path, numbers), -1
         self._pixels = np.zeros((0, 0, 3), np.uint8)
 
     def read(self, number: int) -> NDArray[np.uint8]:
-        """Returns the pixels ``[H, W, 3]`` of frame ``number``, a multiple of N.
+        """Returns the pixels ``[H, W, 3]`` of frame ``number``, one of the given numbers.
 
         Raises:
             FormatError: if it cannot be decoded.
         """
         if number < self._number:
-            self._rest, self._number = read_video(self._path, self._every), -1
+            self._rest, self._number = read_video(self._path, self._numbers), -1
         while self._number < number:
             found = next(self._rest, None)
             if found is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -149,24 +150,32 @@ def _given(folder: Path, depth: bool) -> list[Picture] | None:
         places.append((folder.resolve().parent, folder.resolve().name))
     for place, images in places:
         pictures, above = None, place == folder.resolve().parent and place != folder
-        if above and (app_of(place) is not None or any(place.glob(f"*{R3D}"))):
-            continue  # a recording next to a folder of photographs is not of them
+        if above and not _may_be_of(place, folder.resolve()):
+            continue
         if not depth and (place / _CAMERAS).is_file():
             pictures = _from_cameras_json(place / _CAMERAS, place / images)
-        if pictures is None and (source := _source(place, images, depth)) is not None:
+        source = None if pictures is not None else _source(place, images, depth)
+        if source is not None and not (above and isinstance(source, RGBDFolder) and len(source.scenes) > 1):
             pictures = recording_pictures(source)
-        if pictures is not None and above:  # the cameras may be those of other folders
-            inside_it = [picture for picture in pictures if picture.path and folder.resolve() in _folders(picture.path)]
-            pictures = inside_it or None
+        if pictures is not None and above:  # the cameras may be those of other photographs
+            pictures = [each for each in pictures if each.path and _is_in(each.path, folder.resolve())] or None
         if pictures is not None:
             _name_missing(pictures, place / images)
             return pictures
     return None
 
 
-def _folders(path: Path) -> set[Path]:
-    """Returns the folders that a file is in, by its own path and with links followed."""
-    return {*path.absolute().parents, *path.resolve().parents}
+def _may_be_of(place: Path, folder: Path) -> bool:
+    """Returns whether cameras in ``place`` can be those of a folder in it: not if it has other folders of images."""
+    known = [each.resolve() for each in image_folders(place)]
+    return not known or folder in known
+
+
+def _is_in(path: Path, folder: Path) -> bool:
+    """Returns whether a file, or the link to it, is in a folder or in the one that the folder is a reduced copy of."""
+    parents = {*path.absolute().parents, *path.resolve().parents}
+    original = folder.with_name(re.sub(r"_\d+$", "", folder.name))
+    return folder in parents or original in parents
 
 
 def _source(folder: Path, images: str, depth: bool) -> FileSource | None:

@@ -257,18 +257,18 @@ def _photo(path: Path, content_of: Callable[[Path], bytes | None] = lambda _: No
 
 def _video(path: Path, limit: int) -> list[Picture]:
     count = count_frames(path)
-    every = max(1, count // limit)
-    if count > IN_MEMORY * every:
-        size, frames = video_size(path), VideoFrames(path, every)
+    numbers = range(count) if count <= limit else spread(count, limit)
+    if len(numbers) > IN_MEMORY:
+        size, frames = video_size(path), VideoFrames(path, set(numbers))
 
         def picture(number: int) -> Picture:
             name = f"{path.stem}-{number:06d}"
             return Picture(name, size, lambda wanted: frame_of(shrunk(frames.read(number), wanted)))
 
-        found = [picture(number) for number in range(0, count, every)]
+        found = [picture(number) for number in numbers]
     else:
-        found = [_in_memory(f"{path.stem}-{number:06d}", pixels) for number, pixels in read_video(path, every)]
-    return [replace(each, container=path) for each in evenly(found, limit)]
+        found = [_in_memory(f"{path.stem}-{number:06d}", pixels) for number, pixels in read_video(path, set(numbers))]
+    return [replace(each, container=path) for each in found]
 
 
 def _in_memory(name: str, pixels: NDArray[np.uint8], mask: NDArray[np.float32] | None = None) -> Picture:

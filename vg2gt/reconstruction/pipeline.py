@@ -214,9 +214,11 @@ def add_images(
 
     Raises:
         FileNotFoundError: if the folder keeps no voxels.
-        ValueError: if another model made the scene, or it already has images of the same names.
+        ValueError: if another model made the scene, it has images of the same names, or a removal is unfinished.
     """
     old, anchor = read_scene(folder, renderer, device_of(model)), _anchor(model, folder)
+    if any(was_taken_out(place) for place in (folder / WINDOWS).iterdir()):
+        raise ValueError(f"a --take-out from {folder} was interrupted: repeat it first")
     with pictures_for(model, images, "given") as pictures:
         there = sorted({picture.name for picture in pictures} & set(old.names))
     if there:
@@ -239,6 +241,8 @@ def take_out(
     model: VG2GT, folder: Path, images: ImagesLike, renderer: Renderer, monitor: Monitor, window: int | None = None
 ) -> Scene:
     """Removes images that one command added from the scene in a folder; arguments as for :func:`add_images`.
+
+    Their voxels stay in the folder until ``windows.store.tidy``, which is called once the scene is written.
 
     Raises:
         FileNotFoundError: if the folder keeps no voxels.
@@ -282,6 +286,7 @@ def _joined(old: Scene, new: Scene) -> Scene:
         cameras=Cameras(poses, intrinsics, new.cameras.size),
         mask=None if old.mask is None and new.mask is None else both(*masks),
         names=(*old.names, *new.names),
+        renderer=old.renderer,
         poses=None if old.poses is None or new.poses is None else both(old.poses, new.poses),
         **{name: both(getattr(old, name), getattr(new, name)) for name in ("images", "depth", "depth_conf")},
     )

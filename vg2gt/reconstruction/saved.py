@@ -24,9 +24,6 @@ from vg2gt.types import Cameras
 NEEDED, KNOWN = ("images", "depth", "depth_conf"), ("names", "mask", "error", "support")
 
 
-DEFAULT_NEAR = Renderer().near
-
-
 def read_scene(folder: str | Path, renderer: Renderer, device: torch.device | str = "cpu") -> Scene:
     """Reads a scene that was saved with its cameras and views.
 
@@ -61,7 +58,7 @@ def read_scene(folder: str | Path, renderer: Renderer, device: torch.device | st
         cameras=Cameras(poses.float()[None], intrinsics.float()[None], sizes[0]).to(device),
         **_read_views(folder / "views.npz", named, sizes[0]),
         names=tuple(view_stem(camera.name) for camera in named),
-        renderer=replace(renderer, near=near_of(folder)),
+        renderer=replace(renderer, near=near_of(folder, renderer.near)),
         metres_per_unit=report.get("metres_per_unit") if metres is None else metres,
         cameras_from="" if cameras_from == PREDICTED else cameras_from,
         frame=None if similarity is None else SceneFrame(frame, similarity, None, frame),
@@ -69,10 +66,12 @@ def read_scene(folder: str | Path, renderer: Renderer, device: torch.device | st
     )
 
 
-def near_of(folder: Path) -> float:
-    """Returns the near plane of the scene in a folder, from ``report.json`` if there is one."""
+def near_of(folder: Path, default: float) -> float:
+    """Returns the near plane of the scene in a folder, if its ``report.json`` has one, else the default."""
     file = folder / "report.json"
-    return float(read_json(file).get("near", DEFAULT_NEAR)) if file.is_file() else DEFAULT_NEAR
+    report = read_json(file) if file.is_file() else None
+    near = report.get("near") if isinstance(report, dict) else None
+    return near if isinstance(near, float) and near > 0 else default
 
 
 def _read_views(path: Path, named: list[NamedCamera], size: tuple[int, int]) -> dict[str, Any]:

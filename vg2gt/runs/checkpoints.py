@@ -151,7 +151,7 @@ def initialize_from(module: nn.Module, path: str | Path) -> None:
     refuse_not_finite(stored, path)
     present = {k: v for k, v in module.state_dict().items() if k in stored or not k.startswith("model.backend.")}
     fitting = {k: v for k, v in stored.items() if k in present and present[k].shape == v.shape}
-    frozen = {name for name, value in module.named_parameters() if not value.requires_grad}
+    frozen = {n for n, v in module.named_parameters() if n.startswith("model.backend.") and not v.requires_grad}
     if any(not torch.equal(present[name].cpu(), fitting[name].cpu()) for name in frozen & fitting.keys()):
         raise ValueError(f"init_from={path} holds a trained backbone, but this one is frozen: set backend.freeze=false")
     if not fitting:

@@ -132,8 +132,6 @@ def model_parts(ckpt: str | Path | None, overrides: Sequence[str]) -> tuple[Path
     suits = "backend" not in named or ("backend=sweep" in overrides and all(key in FREE for key in of_backend))
     checkpoint = checkpoint_path(SHIPPED if ckpt is None and suits else ckpt)
     chosen = [override for override, key in zip(overrides, keys, strict=True) if key.partition(".")[0] in named]
-    if checkpoint is None and "model" not in named and "backend=oracle" not in overrides:
-        chosen.append("model=tiny_ungated")  # learned depth is wrong in places, so views check each other
     parts = resolve_parts(compose_groups(*chosen) if chosen else OmegaConf.create(), checkpoint)
     config = OmegaConf.create({part: OmegaConf.to_container(parts[part]) for part in PARTS})
     for override in overrides:
@@ -165,7 +163,7 @@ def resolve_parts(config: DictConfig, checkpoint: Path | None) -> dict[str, Dict
     """Returns the configurations of backend, model and renderer: the checkpoint's, with the overrides in ``config``.
 
     ``model=tiny`` replaces the run's model; ``+model.fine.max_voxels=100000`` changes one key of it. Without a
-    checkpoint, the training defaults are used.
+    checkpoint, the training defaults are used, with ``model=tiny_ungated`` for other backends than ``oracle``.
 
     Raises:
         ValueError: if the checkpoint stores no configuration, or another one decides its tokens.
@@ -175,7 +173,10 @@ def resolve_parts(config: DictConfig, checkpoint: Path | None) -> dict[str, Dict
     parts = {part: value for part, value in given.items() if value is not None and "_target_" in value}
     missing = [part for part in PARTS if part not in parts]
     if missing:
-        run = compose("train", "output_dir=.") if checkpoint is None else _config_of(checkpoint, missing)
+        # the simulated backbone's noise contradicts itself; learned depth is checked against other views
+        learned = "backend" in parts and not parts["backend"]["_target_"].endswith("OracleBackend")
+        model = ["model=tiny_ungated"] if learned else []
+        run = compose("train", "output_dir=.", *model) if checkpoint is None else _config_of(checkpoint, missing)
         parts |= {part: OmegaConf.merge(run[part], given[part] or {}) for part in missing}
     if checkpoint is not None and given["backend"] is not None:
         refuse_other_tokens(parts["backend"], read_checkpoint(checkpoint), checkpoint)

@@ -48,7 +48,7 @@ class COLMAP(FileSource):
 
     layout = "a COLMAP model in sparse/0 or sparse and its images/, there or up to two folders deeper"
     names_are_paths = True
-    index_version = 4
+    index_version = 5
     index_options = ("images", "has_depth")
     sparse_depth = True
     reads_masks = True

@@ -114,10 +114,12 @@ class FileSource(SceneSource):
         if self.is_scene(root):
             return {root.resolve().name: root}
         found: dict[str, Path] = {}
+        scenes: set[Path] = set()
         for folder in (*sorted(root.glob("*")), *sorted(root.glob("*/*"))):
-            if folder.parent in found.values():
+            if folder.parent in scenes:
                 continue  # a part of that scene, such as COLMAP's dense/
             if (folder.is_dir() or folder.suffix.lower() in self.scene_files) and self.is_scene(folder):
+                scenes.add(folder)
                 name = folder.relative_to(root).as_posix() if self.names_are_paths else folder.name
                 _add_scene(found, name, folder)
         return found

@@ -47,7 +47,7 @@ class Nerfstudio(FileSource):
 
     layout = f"{FILE}, or Blender's {', '.join(BLENDER)}, there or up to two folders deeper"
     names_are_paths = True
-    index_version = 4
+    index_version = 5
     index_options = ("has_depth",)
     reads_masks = True
     is_metric = False

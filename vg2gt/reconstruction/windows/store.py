@@ -187,12 +187,15 @@ def read_anchor(folder: Path) -> Anchor:
 
     Raises:
         FileNotFoundError: if there is none; the message names the remedy.
+        ValueError: if an earlier version wrote it.
     """
     if not (folder / ANCHOR).is_file():
         raise FileNotFoundError(
             f"{folder} contains no voxels of a scene: reconstruct it with --window N --keep-windows and given cameras"
         )
     found: dict[str, Any] = read_json(folder / ANCHOR)
+    if "shift" not in found:
+        raise ValueError(f"{folder} was written by an earlier version: reconstruct the scene again")
     found.update({name: np.array(found[name]) for name in ("reference", "shift")}, size=tuple(found["size"]))
     return Anchor(**found)
 
