@@ -60,11 +60,7 @@ def run(options: argparse.Namespace) -> None:
     if not len(gaussians):
         raise ValueError(f"{options.scene} holds no Gaussians; there is nothing to render")
     near = near_of(Path(options.scene).parent, Renderer().near) if options.near is None else options.near
-    renderer = Renderer(
-        mode=options.mode,
-        depth=options.depth,
-        near=near,
-    )
+    renderer = Renderer(mode=options.mode, depth=options.depth, near=near)
     folder = check_folder(options.out, outputs, options.overwrite)
     folder.mkdir(parents=True, exist_ok=True)
     sinks = [map_folder(folder, name) for name in outputs if name in MAPS]
