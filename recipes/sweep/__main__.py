@@ -126,7 +126,8 @@ def main(config: DictConfig) -> None:
     rooms = read_infinigen(config.infinigen.folder, config.scenes.folder) if config.infinigen.folder else []
     count = config.training.steps * config.processes
     every = TrainingSamples(files, count, config.seed, rooms, config.infinigen.share, **config.samples)
-    samples = Subset(every, range(first * config.processes, len(every)))
+    # all of them, from the next one on: Lightning counts those before a checkpoint as read
+    samples = Subset(every, [(first * config.processes + i) % count for i in range(count)])
     if config.begin and not checkpoint:
         for net in (training.net, training.averaged.module):
             net.load_state_dict(load_file(config.begin))

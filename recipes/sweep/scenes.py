@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import os
 from functools import partial
@@ -127,12 +128,14 @@ def read_infinigen(folder: str | os.PathLike[str], cache: str | os.PathLike[str]
     root, paths = Path(cache).expanduser(), []
     source = Infinigen(str(folder))
     for scene in source.scenes:
-        path = root / f"infinigen-{scene.replace('/', '-')}.npz"
+        frames = source.scene_index(scene).folder.resolve()
+        state = hashlib.sha256(f"{frames} {frames.stat().st_mtime_ns}".encode()).hexdigest()[:8]
+        path = root / f"infinigen-{scene.replace('/', '-')}-{state}.npz"
         if not path.is_file():
-            frames = source.load(scene, source.frames(scene))
-            pixels = (frames.images.permute(0, 2, 3, 1) * 255).round().byte()
-            cameras = (frames.world_to_camera.numpy(), frames.intrinsics.numpy())
-            _write(path, _arrays(pixels.numpy(), frames.depth.numpy(), *cameras))
+            read = source.load(scene, source.frames(scene))
+            pixels = (read.images.permute(0, 2, 3, 1) * 255).round().byte()
+            cameras = (read.world_to_camera.numpy(), read.intrinsics.numpy())
+            _write(path, _arrays(pixels.numpy(), read.depth.numpy(), *cameras))
         paths.append(path)
     return paths
 

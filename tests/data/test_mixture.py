@@ -59,6 +59,12 @@ def test_weights_hold_when_the_number_of_views_varies():
     assert abs(share - 0.25) < 0.015
 
 
+def test_a_mixture_of_mixtures_would_ignore_weights() -> None:
+    inner = Mixture({"a": SyntheticScenes(1), "b": SyntheticScenes(1)}, {"a": 9, "b": 1})
+    with pytest.raises(ValueError, match="inner is a mixture itself"):
+        Mixture({"inner": inner, "c": SyntheticScenes(1)}, {"inner": 1, "c": 1})
+
+
 def test_missing_roots_are_named_unless_their_weight_is_zero(tmp_path):
     parts, weights = {"rooms": SyntheticScenes(2), "disk": RGBDFolder}, {"rooms": 1, "disk": 1}
     assert Mixture(parts, {"rooms": 1, "disk": 0}, disk_root=None).sources.keys() == {"rooms"}

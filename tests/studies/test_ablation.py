@@ -19,9 +19,9 @@ from tests.commands import printed
 from tests.training_helpers import SMALL
 from vg2gt.config import compose
 from vg2gt.evaluation.tables import METRICS
-from vg2gt.runs.checkpoints import newest, read_checkpoint
+from vg2gt.runs.checkpoints import newest, read_checkpoint, write_checkpoint
 from vg2gt.studies.ablation import CONTROL, FULL, Ablation, _verdict, common_overrides, continuations
-from vg2gt.studies.study import estimate, over_seeds, paired_difference
+from vg2gt.studies.study import _refuse_other_start, estimate, over_seeds, paired_difference
 
 QUIET = [override for override in SMALL if not override.startswith("trainer.max_steps")]
 
@@ -124,6 +124,16 @@ def test_other_settings_are_refused(finished: Path, cache: Path) -> None:
         study(finished, cache, steps=3).run()
     with pytest.raises(ValueError, match=r"start holds a run with other settings \(loss\.enhance\.weight\)"):
         study(finished, cache, "loss.enhance.weight=2").run()
+
+
+def test_runs_from_other_weights_are_refused(tmp_path: Path) -> None:
+    weights = tmp_path / "a.ckpt"
+    for _ in range(2):
+        write_checkpoint({"state_dict": {"a": torch.zeros(1)}}, weights)
+        _refuse_other_start(str(weights), tmp_path)
+    write_checkpoint({"state_dict": {"a": torch.ones(1)}}, weights)
+    with pytest.raises(ValueError, match="from other weights than .*choose another name="):
+        _refuse_other_start(str(weights), tmp_path)
 
 
 def test_a_full_model_whose_end_is_lost_is_refused(folder: Path, cache: Path) -> None:

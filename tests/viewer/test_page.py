@@ -66,7 +66,8 @@ def test_page_holds_the_gaussians(tmp_path: Path, degree: int) -> None:
 @pytest.mark.parametrize(("behind", "shown"), [(None, [0, 0, 0]), (torch.tensor([[0.25, 0.5, 1.0]]), [0.25, 0.5, 1])])
 def test_page_knows_the_colour_behind_the_scene(tmp_path, behind, shown):
     gaussians = replace(scene(20, 0), background=behind)
-    page = write_viewer_html(tmp_path / "page.html", ViewerScene(gaussians)).read_text()
+    page = write_viewer_html(tmp_path / "page.html", ViewerScene(gaussians, near=0.00125)).read_text()
+    assert '"near": 0.00125' in page
     assert json.loads(re.search(r'id="scene">([^<]*)<', page)[1])["settings"]["background"] == shown
     assert "clearColor(...this.settings.background, 1)" in page
 

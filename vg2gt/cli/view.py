@@ -47,6 +47,8 @@ def run(arguments: argparse.Namespace) -> None:
     """Reads the scene, writes the page and opens it if asked."""
     from vg2gt.io import read_gaussians
     from vg2gt.reconstruction.camera_files import read_cameras
+    from vg2gt.reconstruction.saved import near_of
+    from vg2gt.rendering import Renderer
     from vg2gt.viewer import ViewerScene, write_viewer_html
 
     gaussians = read_gaussians(arguments.scene)
@@ -55,12 +57,11 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.color is not None:
         gaussians = _by_trust(arguments.scene, gaussians)
     title = arguments.title or arguments.scene.name
-    if arguments.cameras is None:
-        scene = ViewerScene(gaussians, title=title)
-    else:
-        cameras, near = read_cameras(arguments.cameras), arguments.cameras.parent
-        sources = [near, near / VIEWS] if arguments.images is None else [arguments.images]
-        scene = ViewerScene(gaussians, cameras, _pictures(cameras, sources), title)
+    scene = ViewerScene(gaussians, title=title, near=near_of(arguments.scene.parent, Renderer().near))
+    if arguments.cameras is not None:
+        cameras, folder = read_cameras(arguments.cameras), arguments.cameras.parent
+        sources = [folder, folder / VIEWS] if arguments.images is None else [arguments.images]
+        scene = replace(scene, cameras=cameras, pictures=_pictures(cameras, sources))
     path = write_viewer_html(arguments.html or arguments.scene.with_suffix(".html"), scene)
     print(f"{path}: {len(gaussians)} Gaussians, {path.stat().st_size / 1e6:.1f} MB; open it in a browser")
     if arguments.open:

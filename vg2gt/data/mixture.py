@@ -22,7 +22,7 @@ class Mixture(SceneSource):
         common: arguments of the factories: ``<part>_<argument>`` goes to one part, any other to all parts.
 
     Raises:
-        ValueError: if parts and weights do not match.
+        ValueError: if parts and weights do not match, or a part is a mixture.
         FileNotFoundError: if a part's root is not given or does not exist.
         DataError: if a part has no scene.
     """
@@ -36,6 +36,8 @@ class Mixture(SceneSource):
         _check(parts, weights)
         self.weights = {name: weights[name] for name in parts if weights[name] > 0}
         self.sources = {name: _make(name, parts[name], list(parts), common) for name in self.weights}
+        if nested := [name for name, source in self.sources.items() if len(source.parts()) > 1]:
+            raise ValueError(f"the part {nested[0]} is a mixture itself: name its parts here, with their weights")
         self.is_metric = all(source.is_metric for source in self.sources.values())
         self.has_depth = all(source.has_depth for source in self.sources.values())
         self.dense_depth = all(source.dense_depth for source in self.sources.values())

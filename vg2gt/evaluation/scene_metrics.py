@@ -54,6 +54,8 @@ def rendered_normal_metrics(rendered: Render, truth: Batch) -> dict[str, float]:
 def edge_metrics(rendered: Render, truth: Batch, alignment: str) -> dict[str, float]:
     """``edge_psnr`` and ``edge_abs_rel`` of one scene, within 3 pixels of true depth edges; NaN if there are none."""
     region = near_depth_edges(truth.depth)
+    if truth.mask is not None:
+        region &= truth.mask > 0
     depth = depth_metrics(rendered.depth[0], truth.depth[0], alignment, region=region[0])
     error = (rendered.color.clamp(0, 1) - truth.images.clamp(0, 1)).double().square().mean(2)[0]  # [V, H, W]
     per_view = [e[r].mean() for e, r in zip(error, region[0], strict=True) if r.any()]

@@ -73,12 +73,12 @@ def color_image(image: Image.Image) -> Image.Image:
 
 
 def colorize_depth(depth: Tensor, near: float, far: float) -> Tensor:
-    """Colours z-depth ``[H, W]`` between ``near`` (bright) and ``far`` (dark), ``[3, H, W]``; holes (0) are grey."""
+    """Colours z-depth ``[H, W]`` between ``near`` (bright) and ``far`` (dark), ``[3, H, W]``; 0 and NaN are grey."""
     position = ((depth - near) / max(far - near, 1e-9)).clamp(0, 1) * (len(_DEPTH_ANCHORS) - 1)
-    index = position.long().clamp(max=len(_DEPTH_ANCHORS) - 2)
+    index = position.nan_to_num(0.0).long().clamp(max=len(_DEPTH_ANCHORS) - 2)
     anchors = _DEPTH_ANCHORS.to(depth.device)
     colors = torch.lerp(anchors[index], anchors[index + 1], (position - index)[..., None])
-    colors[depth <= 0] = 0.5
+    colors[~(depth > 0)] = 0.5
     return colors.permute(2, 0, 1)
 
 

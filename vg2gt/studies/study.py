@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import hashlib
 import logging
 import math
 import statistics
@@ -17,7 +18,7 @@ from scipy.stats import t as student
 from vg2gt.config import compose, flatten
 from vg2gt.evaluation.tables import Metric, markdown_table, number
 from vg2gt.io.files import read_json, write_json, write_text
-from vg2gt.runs.checkpoints import read_checkpoint, write_checkpoint
+from vg2gt.runs.checkpoints import checkpoint_path, read_checkpoint, write_checkpoint
 from vg2gt.runs.trust import read_run_config
 from vg2gt.training.loop import build, evaluate, train
 from vg2gt.training.start import load_start
@@ -46,12 +47,13 @@ def run_once(overrides: Sequence[str], folder: Path, scored: bool = True) -> Met
         scored: whether a run of 0 steps is evaluated, which needs its data.
 
     Raises:
-        ValueError: if the folder holds the run of another configuration.
+        ValueError: if the folder holds the run of another configuration, or from other weights.
         SystemExit: if the training was asked to stop (SIGTERM); the same call resumes it.
     """
     config = compose_run(overrides, folder)
     config.training.rasterized_depth = True  # studies report it
     _refuse_other_run(config, folder)
+    _refuse_other_start(config.init_from, folder)
     result = folder / "metrics.json"
     if result.is_file():
         return read_json(result)["trained"]
@@ -96,6 +98,19 @@ def _refuse_other_run(config: DictConfig, folder: Path) -> None:
             f"{folder} holds a run with other settings ({', '.join(other)}): choose another name=, repeat the "
             "settings, or delete the whole study"
         )
+
+
+def _refuse_other_start(init_from: str | None, folder: Path) -> None:
+    """Raises ValueError if the folder holds a run that began from other weights; notes their hash if it is new."""
+    if init_from is None or not Path(init_from).exists():
+        return
+    path = checkpoint_path(init_from, "init_from")
+    assert path is not None
+    digest, noted = hashlib.sha256(path.read_bytes()).hexdigest(), folder / "init_from.sha256"
+    if noted.is_file() and noted.read_text().strip() != digest:
+        read_checkpoint(path)  # raises if it is damaged
+        raise ValueError(f"{folder} holds a run from other weights than {init_from}: choose another name=")
+    write_text(noted, digest + "\n")
 
 
 def final_checkpoint(folder: Path, steps: int) -> Path:

@@ -15,6 +15,7 @@ from vg2gt.io.arrays import read_npz
 from vg2gt.io.cameras_json import NamedCamera, invert_pose
 from vg2gt.io.images import color_image, open_image
 from vg2gt.io.points import scene_extent
+from vg2gt.rendering.options import RenderOptions
 from vg2gt.types import Gaussians
 
 FRUSTUM_SHARE = 0.02  # depth of a drawn frustum, relative to the scene's extent
@@ -32,12 +33,14 @@ class ViewerScene:
         cameras: the cameras to draw; the first is the initial view.
         pictures: ``[H, W, 3]`` uint8 or None, one per camera; empty: no pictures.
         title: title of the page.
+        near: near plane in scene units.
     """
 
     gaussians: Gaussians
     cameras: Sequence[NamedCamera] = ()
     pictures: Sequence[NDArray[np.uint8] | None] = ()
     title: str = "scene"
+    near: float = RenderOptions.near
 
     def initial(self) -> NamedCamera:
         """Returns the initial view: the first camera, else :func:`default_camera`."""

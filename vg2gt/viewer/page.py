@@ -108,7 +108,7 @@ def _content(scene: ViewerScene, header: dict[str, float]) -> dict[str, Any]:
         "initial": scene.initial().fields(),
         "frustum_depth": scene.frustum_depth(),
         "settings": {
-            "near": options.near,
+            "near": scene.near,
             "background": [0.0, 0.0, 0.0] if behind is None else behind[0].tolist(),
             "lowpass": options.lowpass,
             "alpha_max": options.alpha_max,

@@ -56,7 +56,8 @@ def write_polycam(root: Path, frames: Frames, corrected: bool = True) -> None:
     for i, pose in enumerate(camera_to_world(frames) @ OPENGL):
         name = str(1667263848031 + 33 * i)
         fx, fy, cx, cy = camera_of(frames) + CORNER
-        camera = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": SIZE[1], "height": SIZE[0], "blur_score": 80.5}
+        camera = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": SIZE[1], "height": SIZE[0]}
+        camera = {name: 2 * value for name, value in camera.items()} | {"blur_score": 80.5}  # of larger images
         camera |= {f"t_{row}{column}": pose[row, column] for row in range(3) for column in range(4)}
         before = "corrected_" if corrected else ""
         save(folder / f"{before}images" / f"{name}.jpg", pixels(frames)[i])

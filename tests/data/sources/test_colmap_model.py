@@ -10,6 +10,7 @@ from PIL import Image
 from vg2gt.data import DataError
 from vg2gt.data.batches import BatchDataset
 from vg2gt.data.sources import COLMAP
+from vg2gt.data.sources.parsing import existing_image
 from vg2gt.data.sources.undistortion import undistortion_of
 from vg2gt.data.transforms import resize_to_cover
 from vg2gt.data.views import SceneSample
@@ -102,6 +103,13 @@ def test_exif_orientation_with_given_cameras(tmp_path, orientation, stored):
     Image.new("RGB", (40, 36)).save(path, exif=exif)
     with pytest.raises(DataError, match=r"40x36 pixels, but its camera in .* is 40x30: use the camera's own"):
         COLMAP(str(tmp_path)).scene_index("statue")
+
+
+def test_another_camera_of_a_rig_is_no_reduced_copy(tmp_path):
+    for place in ("images/cam_1", "other/images_4"):
+        save(tmp_path / place / "000.png", np.zeros((30, 40, 3), np.uint8))
+    assert existing_image(tmp_path / "images" / "cam" / "000.png") is None
+    assert existing_image(tmp_path / "other" / "images" / "000.png") == tmp_path / "other" / "images_4" / "000.png"
 
 
 def test_reduced_images_have_reduced_intrinsics(tmp_path):

@@ -22,7 +22,7 @@ from vg2gt.data.sources.parsing import expanded
 from vg2gt.data.sources.undistortion import undistortion_of
 from vg2gt.data.transforms import from_bytes, resize_depth, resize_images, resize_to_cover
 from vg2gt.io.files import write_cached
-from vg2gt.io.image_files import Size, read_color, read_depth, read_mask, read_mask_file
+from vg2gt.io.image_files import Size, check_size, read_color, read_depth, read_mask, read_mask_file
 
 log = logging.getLogger(__name__)
 
@@ -211,6 +211,8 @@ class FileSource(SceneSource):
 
     def _load_frame(self, index: SceneIndex, row: int, whole: bool = False) -> Frames:
         pixels = self.read_color(index, row)
+        if index.color_size is None:
+            check_size(index.color[row], index.name, pixels.shape[:2], index.own_size(row))
         images = from_bytes(torch.from_numpy(pixels)).permute(2, 0, 1)[None].contiguous()  # [1, 3, H, W]
         depth = torch.zeros_like(images[:, 0])  # [1, H, W]
         if index.depth:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -84,7 +85,10 @@ class Nerfstudio(FileSource):
             depth = {i: path for i, path in depth.items() if path.is_file()}
             masks = _named_files(folder, records, "mask_path", where)
         if not masks:
-            masks = find_masks(folder / MASKS, {i: path.name for i, path in color.items()}, f"scene {scene}")
+            counts = Counter(path.name for path in color.values())
+            inside = {i: "/".join(Path(records[i].file_path).parts[1:]) for i in color}  # for the cameras of a rig
+            names = {i: path.name if counts[path.name] == 1 else inside[i] for i, path in color.items()}
+            masks = find_masks(folder / MASKS, names, f"scene {scene}")
         if not color:
             tried = f"; tried {named[0]} and other endings" if named else ""
             raise DataError(f"scene {scene}: none of the {len(records)} images of {where} exists{tried}")

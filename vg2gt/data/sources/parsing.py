@@ -117,16 +117,19 @@ def named_file(folder: Path, name: str, where: str) -> Path:
     return folder / os.path.relpath(path, root)
 
 
+_WHOLE = ("images", "image", "rgb", "color", "input")  # folders that have reduced copies
+
+
 def existing_image(path: Path) -> Path | None:
     """Finds an image by its path, or by its name with another or an additional suffix; None if there is none.
 
-    Models and lists often contain file names from before a conversion. If the folder is missing, the least downsampled
-    copy of it is used (``images_4`` rather than ``images_8``, as in DL3DV).
+    Models and lists often contain file names from before a conversion. If the folder ``images`` or the like is
+    missing, the least downsampled copy of it is used (``images_4`` rather than ``images_8``, as in DL3DV).
     """
     if path.is_file():
         return path
     folder = path.parent
-    if not folder.is_dir():
+    if not folder.is_dir() and folder.name in _WHOLE:  # others, such as cam_1, are cameras of a rig
         reduced = folder.parent.glob(f"{glob.escape(folder.name)}_[0-9]*")
         largest = min(reduced, key=lambda each: by_number(each.name), default=None)
         return None if largest is None else existing_image(largest / path.name)

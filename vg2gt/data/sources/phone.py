@@ -130,13 +130,15 @@ def _read_polycam(folder: Path, scene: str) -> Recording:
     corrected = (inside / "corrected_cameras").is_dir() and (inside / "corrected_images").is_dir()
     before = "corrected_" if corrected else ""
     color, depth = numbered(inside / f"{before}images", scene), numbered(inside / "depth", scene)
+    size = image_size(next(iter(color.values())), scene) if color else (0, 0)
     poses, intrinsics = {}, {}
     for frame, path in numbered(inside / f"{before}cameras", scene, suffixes=(".json",)).items():
         content = read_json(path)
         rows = _numbers(path, content, *(f"t_{row}{column}" for row in range(3) for column in range(4)))
         poses[frame] = np.vstack((rows.reshape(3, 4), [0, 0, 0, 1])) @ _OPENGL
-        intrinsics[frame] = pinhole(*_numbers(path, content, "fx", "fy", "cx", "cy")) - CORNER_TO_CENTER
-    size = image_size(next(iter(color.values())), scene) if color else (0, 0)
+        width, height = _numbers(path, content, "width", "height")
+        camera = pinhole(*_numbers(path, content, "fx", "fy", "cx", "cy"))
+        intrinsics[frame] = np.diag([size[1] / width, size[0] / height, 1.0]) @ camera - CORNER_TO_CENTER
     return Recording(color, depth, poses, intrinsics, size)
 
 
