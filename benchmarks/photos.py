@@ -5,8 +5,8 @@ sees it, nor points that only it saw. Evaluates the feed-forward scene, and scen
 ``--budgets``: core-seconds of one thread, including the feed-forward pass but not structure from motion. ``--model``
 and ``--refine`` change settings for comparison, such as ``--model fine.min_footprint=6.2`` or
 ``--refine rates.cameras=0``. ``--opensplat BINARY`` trains OpenSplat on the same images, cameras and points with the
-same budgets. New rows replace those of the newest file with the same set, size, program, settings and budget; other
-rows are kept. Writes JSON and a table to ``benchmarks/results``, and a picture of each set to ``--work``.
+same budgets. New rows replace those of the newest file with the same set, size, program, settings, weights and budget;
+other rows are kept. Writes JSON and a table to ``benchmarks/results``, and a picture of each set to ``--work``.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from vg2gt.types import Cameras, Gaussians
 OURS, PEER = "VG²GT", "OpenSplat"
 FEED_FORWARD = "feed-forward"
 PICTURED = 4  # held-out views per picture, evenly spread
-KEY = ("set", "size", "program", "settings", "budget")
+KEY = ("set", "size", "program", "settings", "weights", "budget")
 Row = dict[str, Any]
 
 
@@ -189,7 +189,7 @@ def merged(folder: Path, rows: Sequence[Row]) -> list[Row]:
 
 def _order(row: Row) -> tuple[Any, ...]:
     budget = 0.0 if row["budget"] == FEED_FORWARD else float(row["budget"])
-    return row["size"], row["set"], row["program"] != OURS, row["settings"], budget
+    return row["size"], row["set"], row["program"] != OURS, row["settings"], row["weights"], budget
 
 
 def tables(rows: Sequence[Row]) -> str:
@@ -200,10 +200,12 @@ def tables(rows: Sequence[Row]) -> str:
         budgets = list(dict.fromkeys(row["budget"] for row in sorted(some, key=lambda row: _order(row)[-1])))
         lines: dict[tuple[str, ...], dict[Any, str]] = {}
         for row in some:
-            lines.setdefault((row["set"], row["program"], row["settings"]), {})[row["budget"]] = _short(row)
+            lines.setdefault((row["set"], row["program"], row["settings"], row["weights"]), {})[row["budget"]] = _short(
+                row
+            )
         cells = [[*key, *(of.get(budget, "") for budget in budgets)] for key, of in lines.items()]
-        head = ("set", "program", "settings", *map(_budget, budgets))
-        parts += [f"## Longer side {size}", markdown_table(head, cells, 3)]
+        head = ("set", "program", "settings", "weights", *map(_budget, budgets))
+        parts += [f"## Longer side {size}", markdown_table(head, cells, 4)]
     shown = columns("psnr", "ssim", "lpips", "gaussians", decimals={"psnr": 2})
     for name in ("psnr", "ssim"):
         shown[f"{name}_given"] = replace(METRICS[name], label=f"{METRICS[name].label}, given")
@@ -252,6 +254,7 @@ def main() -> None:
     of_model = ["+" * change.startswith("+") + f"model.{change.removeprefix('+')}" for change in given.model]
     loaded = load_model(given.ckpt, overrides=of_model, device="cpu")
     size = [f"working-size={given.working_size}"] if given.working_size else []
+    weights = (loaded.weights.digest or "none")[:8]  # of the head, which belongs to one backbone
     settings = " ".join(sorted([*size, *of_model, *changes])) or "default"
     try:
         lpips = load_lpips()
@@ -269,10 +272,10 @@ def main() -> None:
         if not given.only_peer:
             warm_up(loaded, photos, refinement)
             found = ours(loaded, scores, refinement, given.budgets, given.working_size)
-            rows += [{**common, "program": OURS, "settings": settings, **row} for row in found]
+            rows += [{**common, "program": OURS, "settings": settings, "weights": weights, **row} for row in found]
         if given.opensplat:
             found = peer(given.opensplat, scores, given.budgets)
-            rows += [{**common, "program": PEER, "settings": "default", **row} for row in found]
+            rows += [{**common, "program": PEER, "settings": "default", "weights": "", **row} for row in found]
         for row in rows:
             spent = f"{row['core_seconds']:.0f} core-seconds, {row['gaussians']} Gaussians"
             print(f"{name}, {row['program']}, {_budget(row['budget'])}: {_short(row)}, {spent}", flush=True)
