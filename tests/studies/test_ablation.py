@@ -132,7 +132,7 @@ def test_runs_from_other_weights_are_refused(tmp_path: Path) -> None:
         write_checkpoint({"state_dict": {"a": torch.zeros(1)}}, weights)
         _refuse_other_start(str(weights), tmp_path)
     write_checkpoint({"state_dict": {"a": torch.ones(1)}}, weights)
-    with pytest.raises(ValueError, match="from other weights than .*choose another name="):
+    with pytest.raises(ValueError, match=r"from other weights than .*choose another name="):
         _refuse_other_start(str(weights), tmp_path)
 
 
