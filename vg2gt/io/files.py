@@ -113,7 +113,7 @@ def whole_folder(target: Path) -> Iterator[Path]:
         yield staged
         if target.exists():
             before = temporary_name(target)
-            os.replace(target, before)  # so that no time without a whole folder is lost to its removal
+            os.replace(target, before)  # removing it here would take time without either
             os.replace(staged, target)
             shutil.rmtree(before)
         else:

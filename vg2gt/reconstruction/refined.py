@@ -71,7 +71,7 @@ def refinement_figures(scene: Scene) -> dict[str, Any]:
 
 
 def _mean(psnr: Tensor) -> float:
-    """Returns the mean over the views of which not all pixels are masked."""
+    """Returns the mean PSNR ``[V]`` over the views of which not all pixels are masked; 0 if there are none."""
     return float(psnr[psnr.isfinite()].mean()) if psnr.isfinite().any() else 0.0
 
 

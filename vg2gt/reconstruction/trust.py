@@ -110,6 +110,7 @@ def trust_line(scene: Scene) -> str:
     if figures is None:
         return "support of the Gaussians is unknown for scenes made in windows"
     shares = ", ".join(f"{100 * share:.0f} % {name}" for name, share in figures["gaussians"].items() if share >= 0.005)
+    shares += " (agreed: two or more views see it at the same depth)"
     if "error_of_pixels" not in figures:
         return f"Gaussians: {shares}; errors are not stated (no calibration of this model)"
     error = 100 * figures["error_of_pixels"]
