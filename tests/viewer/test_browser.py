@@ -44,6 +44,18 @@ def show(page: Any, path: Path, scene: ViewerScene, size: tuple[int, int], fragm
     page.evaluate("vg2gtViewer.ready.then(() => null)")
 
 
+def ball_before_a_wall() -> ViewerScene:
+    """A red ball of radius 0.5 at depth 4, and a larger grey wall of more Gaussians at depth 12; no cameras."""
+    generator = torch.Generator().manual_seed(3)
+    ball = torch.nn.functional.normalize(torch.randn(400, 3, generator=generator), dim=-1) * 0.5
+    wall = (torch.rand(1500, 3, generator=generator) - 0.5) * torch.tensor([40.0, 40.0, 0.1])
+    means = torch.cat((ball + torch.tensor([0, 0, 4.0]), wall + torch.tensor([0, 0, 12.0])))
+    red, grey = torch.tensor([2.2, -1.6, -1.6]).expand(400, 1, 3), torch.zeros(1500, 1, 3)
+    scales = torch.cat((torch.full((400, 3), 0.06), torch.full((1500, 3), 0.6)))
+    quats, one = torch.tensor([1.0, 0, 0, 0]).expand(1900, 4), torch.full((1900,), 0.95)
+    return ViewerScene(Gaussians(means, quats, scales, one, torch.cat((red, grey)), torch.zeros(1900).long()))
+
+
 def screenshot(page: Any) -> np.ndarray:
     """``[H, W, 3]`` uint8."""
     return np.array(Image.open(io.BytesIO(page.screenshot())).convert("RGB"))
@@ -103,6 +115,48 @@ def test_controls_move_the_view_and_reset_brings_it_back(page: Any, tmp_path: Pa
         page.evaluate("document.getElementById('reset').click()")
         page.wait_for_timeout(700)
         assert (screenshot(page) == before).all(), name
+
+
+def red_share(page: Any, mid: tuple[float, float] = (0.5, 0.5)) -> tuple[float, float]:
+    """Share of the page's pixels that show the ball, and the distance of their middle from ``mid``, in page sizes."""
+    image = screenshot(page).astype(float)
+    red = (image[..., 0] > 120) & (image[..., 0] > 2 * image[..., 2])
+    places = np.argwhere(red) / red.shape
+    return float(red.mean()), float(np.abs(places.mean(0) - mid).max()) if len(places) else 1.0
+
+
+@pytest.mark.parametrize("fragment", ["", "#fly=on"])
+@pytest.mark.parametrize("phone", [False, True])
+def test_drag_of_100_pixels_keeps_the_object_in_view(page: Any, tmp_path: Path, phone: bool, fragment: str) -> None:
+    """Flying, the same drag looks away from it: the page opened so, and the test sees the difference."""
+    size = (844, 390) if phone else (600, 900)
+    context = page.context.browser.new_context(
+        viewport={"height": size[0], "width": size[1]}, is_mobile=phone, has_touch=phone
+    )
+    opened = context.new_page()
+    opened.set_default_timeout(240e3)
+    show(opened, tmp_path / "page.html", ball_before_a_wall(), size, fragment)
+    before, off = red_share(opened)
+    assert before > 0.01
+    assert off < 0.02
+    if phone:
+        touch = context.new_cdp_session(opened)
+        for kind, x in [("touchStart", 150), *(("touchMove", x) for x in range(160, 251, 10)), ("touchEnd", None)]:
+            points = [] if x is None else [{"x": x, "y": 600}]
+            touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+    else:
+        opened.mouse.move(500, 400)
+        opened.mouse.down()
+        opened.mouse.move(600, 400, steps=10)
+        opened.mouse.up()
+    opened.evaluate("new Promise((done) => setTimeout(done, 500))")
+    after, moved = red_share(opened)
+    context.close()
+    if fragment:
+        assert moved > 0.3
+    else:
+        assert after == pytest.approx(before, rel=0.2)
+        assert moved < 0.05
 
 
 def test_page_fetches_nothing_and_hostile_names_do_nothing(page: Any, tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from tests.io.gaussian_scenes import scene, views
 from tests.viewer.reading import read_viewer_html
 from vg2gt.cli import view
 from vg2gt.io import named_cameras, write_cameras_json, write_gaussian_ply, write_spz
+from vg2gt.viewer import scene_title
 
 
 @pytest.fixture
@@ -35,7 +36,7 @@ def test_page_of_a_file(files: Path, capsys: pytest.CaptureFixture, monkeypatch,
     run(files / name)
     page = files / "scene.html"
     assert len(read_viewer_html(page)) == 60
-    assert f"<title>{name}</title>" in page.read_text()
+    assert f"<title>{files.name}</title>" in page.read_text()
     assert page.read_text().count('"picture": "') == 2
     printed = capsys.readouterr().out
     assert f"2 of 3 cameras have their image in {files}" in printed
@@ -44,6 +45,18 @@ def test_page_of_a_file(files: Path, capsys: pytest.CaptureFixture, monkeypatch,
     run(files / name, "--html", elsewhere, "--cameras", files / "cameras.json", "--images", files / "none", "--open")
     assert "photographs are not shown: none in" in capsys.readouterr().out
     assert opened == [elsewhere.as_uri()]
+
+
+def test_title_is_the_name_of_the_scene_or_its_folder(files: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (files / "scene.ply").rename(files / "old shed.ply")
+    run(files / "old shed.ply")
+    assert "<title>old shed</title>" in (files / "old shed.html").read_text()
+    inside = files / "inside"
+    inside.mkdir()
+    monkeypatch.chdir(inside)
+    names = {"scene.ply": "inside", "../scene.spz": files.name, "../out/../kitchen.v2.ply": "kitchen.v2"}
+    assert {name: scene_title(name) for name in names} == names
+    assert scene_title("/scene.ply") == "scene"
 
 
 def test_images_that_reconstruct_writes_are_found(files: Path, capsys: pytest.CaptureFixture) -> None:

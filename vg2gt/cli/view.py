@@ -32,7 +32,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     add("--color", choices=("trust",), help="trust: colour by stated error and status of a scene.ply written by vg2gt")
     add("--html", type=Path, metavar="FILE", help="the page to write; default: SCENE.html next to the scene")
     add("--open", action="store_true", help="open the page in the browser")
-    add("--title", help="title of the page; default: the scene's file name")
+    add("--title", help="title of the page; default: the scene's name, of scene.ply its folder's")
     arguments = parser.parse_args(argv)
     known = arguments.scene.parent / CAMERAS
     if arguments.cameras is None and known.is_file():
@@ -49,14 +49,14 @@ def run(arguments: argparse.Namespace) -> None:
     from vg2gt.reconstruction.camera_files import read_cameras
     from vg2gt.reconstruction.saved import near_of
     from vg2gt.rendering import Renderer
-    from vg2gt.viewer import ViewerScene, write_viewer_html
+    from vg2gt.viewer import ViewerScene, scene_title, write_viewer_html
 
     gaussians = read_gaussians(arguments.scene)
     if not len(gaussians):
         raise ValueError(f"{arguments.scene} holds no Gaussians")
     if arguments.color is not None:
         gaussians = _by_trust(arguments.scene, gaussians)
-    title = arguments.title or arguments.scene.name
+    title = arguments.title or scene_title(arguments.scene)
     scene = ViewerScene(gaussians, title=title, near=near_of(arguments.scene.parent, Renderer().near))
     if arguments.cameras is not None:
         cameras, folder = read_cameras(arguments.cameras), arguments.cameras.parent

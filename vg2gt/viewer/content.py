@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -70,6 +71,12 @@ def default_camera(gaussians: Gaussians) -> NamedCamera:
         radius = max(float(np.linalg.norm(high - low)) / 2, 1e-3)
         pose[:3, 3] = -(low + high) / 2 + [0, 0, radius / float(reach.min())]
     return NamedCamera("default", width, height, intrinsics, pose)
+
+
+def scene_title(path: str | Path) -> str:
+    """Returns the title of a scene's file: its name, or its folder's if it is called ``scene``, as ours are."""
+    full = Path(os.path.abspath(path))  # of ``.`` and ``..`` too; links keep their names
+    return full.parent.name or full.stem if full.stem == "scene" else full.stem
 
 
 def load_pictures(cameras: Sequence[NamedCamera], source: str | Path) -> list[NDArray[np.uint8] | None]:

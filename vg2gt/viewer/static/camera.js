@@ -82,14 +82,3 @@ class View {
     this.pivot = distance;
   }
 }
-
-// Middle depth of the Gaussians in view, or the fallback where there are none.
-function typicalDepth(view, means, fallback) {
-  const { axes, center, lens } = view, depths = [], step = Math.max(1, Math.floor(means.length / 3 / 20000));
-  for (let i = 0; i < means.length / 3; i += step) {
-    const offset = [0, 1, 2].map((k) => means[3 * i + k] - center[k]), depth = dot(offset, axes[2]);
-    const x = lens.fx * dot(offset, axes[0]) / depth + lens.cx, y = lens.fy * dot(offset, axes[1]) / depth + lens.cy;
-    if (depth > 0 && x > 0 && y > 0 && x < lens.width && y < lens.height) depths.push(depth);
-  }
-  return depths.length ? depths.sort((a, b) => a - b)[depths.length >> 1] : fallback;
-}

@@ -1,6 +1,6 @@
 // Wires the page together. window.vg2gtViewer is for scripts: ready (a promise), setCamera(index or camera record), which
 // resolves when that view is drawn completely, and loadSeconds. The address may end in
-// #camera=INDEX&show=cameras,images&ui=off.
+// #camera=INDEX&show=cameras,images&fly=on&ui=off (address.js).
 
 const started = performance.now();
 const element = (id) => document.getElementById(id);
@@ -8,15 +8,6 @@ const element = (id) => document.getElementById(id);
 function say(text, isError = false) {
   element("status").textContent = text;
   element("status").classList.toggle("error", isError);
-}
-
-function requested() {
-  const parameters = new URLSearchParams(location.hash.slice(1));
-  return {
-    camera: Number.parseInt(parameters.get("camera") ?? "0", 10),
-    show: (parameters.get("show") ?? "").split(","),
-    panel: parameters.get("ui") !== "off",
-  };
 }
 
 async function start() {
@@ -81,17 +72,24 @@ async function start() {
     const record = typeof camera === "number" ? records[camera] : camera;
     if (!record) throw new Error(`There is no camera ${camera}; the scene has ${records.length}.`);
     view.set(fromRecord(record));
-    view.pivot = typicalDepth(view, means, 50 * scene.frustum_depth);
+    view.pivot = pivotDepth(view, geometry, scene);
     if (typeof camera === "number") element("cameras").selectedIndex = camera;
     return complete();
   }
 
-  connect({ canvas, view, changed, resized, setCamera, show, records, scene, pictures });
-  const wanted = requested();
-  await setCamera(records[wanted.camera] ? wanted.camera : 0);
+  const follow = connect({ canvas, view, changed, resized, setCamera, show, records, scene, pictures });
+  await follow(0);
   viewer.loadSeconds = (performance.now() - started) / 1000;
-  say(`${scene.gaussians.count.toLocaleString("en")} Gaussians, ${scene.cameras.length} cameras`);
   return setCamera;
+}
+
+// Depth of what is in the middle of a camera's image, so that turning keeps it there.
+function pivotDepth(view, geometry, { settings, frustum_depth }) {
+  const { width, height } = view.lens, shares = [0.45, 0.5, 0.55], blur = settings.lowpass, near = settings.near;
+  const places = shares.flatMap((x) => shares.map((y) => [x * width - 0.5, y * height - 0.5]));
+  const depths = places.map((place) => surfaceDepth(geometry, view, view.lens, place, { near, blur }));
+  const found = depths.filter((depth) => depth !== null).sort((a, b) => a - b);
+  return found.length ? found[found.length >> 1] : 50 * frustum_depth;
 }
 
 // Buttons, boxes, keys, window.
@@ -111,27 +109,37 @@ function connect({ canvas, view, changed, resized, setCamera, show, records, sce
   element("next").addEventListener("click", () => walk(1));
   element("previous").addEventListener("click", () => walk(-1));
   element("reset").addEventListener("click", reset);
-  const box = (id, enabled, apply) => {
-    element(id).disabled = !enabled;
-    element(id).checked = enabled && requested().show.includes(id.slice("show-".length));
-    apply(element(id).checked);
-    element(id).addEventListener("change", () => {
-      apply(element(id).checked);
+  const boxes = {
+    cameras: [element("show-cameras"), scene.cameras.length > 0, (on) => { show.frusta = on; }],
+    images: [element("show-images"), pictures.some(Boolean), (on) => { show.images = on; }],
+    fly: [element("fly"), true, (on) => { controls.fly = on; }],
+  };
+  for (const [box, enabled, apply] of Object.values(boxes)) {
+    box.disabled = !enabled;
+    box.addEventListener("change", () => {
+      apply(box.checked);
       changed();
     });
+  }
+  const counts = `${scene.gaussians.count.toLocaleString("en")} Gaussians, ${scene.cameras.length} cameras`;
+  const follow = (otherwise) => {  // does what the address asks for; otherwise: the camera if it names none, null: stay
+    const wanted = readAddress(location.hash, records.length);
+    element("panel").hidden = !wanted.panel;
+    for (const [name, [box, enabled, apply]] of Object.entries(boxes)) {
+      box.checked = enabled && wanted.boxes[name];
+      apply(box.checked);
+    }
+    say(wanted.problem || counts, Boolean(wanted.problem));
+    const camera = wanted.camera ?? otherwise;
+    return camera === null ? changed() : setCamera(camera);
   };
-  box("show-cameras", scene.cameras.length > 0, (on) => { show.frusta = on; });
-  box("show-images", pictures.some(Boolean), (on) => { show.images = on; });
-  box("fly", true, (on) => { controls.fly = on; });
   new ResizeObserver(resized).observe(canvas);
-  window.addEventListener("hashchange", () => {
-    element("panel").hidden = !requested().panel;
-    if (records[requested().camera]) setCamera(requested().camera);
-  });
+  window.addEventListener("hashchange", () => follow(null));
   canvas.addEventListener("webglcontextlost", () => say("The graphics device was lost; reload the page.", true));
+  return follow;
 }
 
-element("panel").hidden = !requested().panel;
+element("panel").hidden = !readAddress(location.hash, Infinity).panel;
 const viewer = { ready: null, loadSeconds: null };
 viewer.ready = start();
 viewer.setCamera = async (camera) => (await viewer.ready)(camera);

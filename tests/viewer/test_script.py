@@ -1,0 +1,106 @@
+"""The page's script without a browser: node runs its parts. ``test_browser.py`` (slow) drives the whole page."""
+
+import json
+import shutil
+import subprocess
+from typing import Any
+
+import pytest
+import torch
+
+from tests.viewer.test_browser import ball_before_a_wall
+from vg2gt.viewer.page import SCRIPTS, STATIC
+
+# what main.js needs of a browser to wire the boxes: elements that remember what is set, and an address
+DOM = """
+const made = {}, listens = { addEventListener() {} };
+const stub = () => ({ ...listens, classList: { toggle() {} }, append() {}, textContent: "", checked: false });
+globalThis.document = { getElementById: (id) => (made[id] ??= stub()) };
+globalThis.window = listens;
+globalThis.location = { hash: "" };
+globalThis.ResizeObserver = class { observe() {} };
+globalThis.Option = class {};
+"""
+
+
+def run(code: str) -> Any:
+    """Runs code after the page's scripts, and returns the JSON that its ``answer`` is."""
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("needs node: apt-get install nodejs")
+    script = "\n".join((STATIC / name).read_text() for name in SCRIPTS)
+    program = f"{DOM}{script}\nlet answer;\n{code}\nconsole.log(JSON.stringify(answer));"
+    done = subprocess.run([node, "-"], input=program, capture_output=True, text=True, timeout=60, check=False)
+    assert not done.returncode, done.stderr
+    return json.loads(done.stdout)
+
+
+OPENED = """
+const show = {}, scene = { gaussians: { count: 5 }, cameras: [{ name: "a" }, { name: "b" }] };
+const keep = { canvas: { ...stub(), tabIndex: 0 }, view: {}, changed() {}, show, records: scene.cameras, scene };
+answer = [HASHES].map((hash) => {
+  location.hash = hash;
+  let seen = null;
+  const follow = connect({ ...keep, pictures: [{}], resized() {}, setCamera(camera) { seen = camera; } });
+  follow(0);
+  const boxes = ["show-cameras", "show-images", "fly"].map((id) => made[id].checked);
+  return [boxes, seen, made.panel.hidden, made.status.textContent];
+});
+"""
+
+
+def test_address_and_boxes() -> None:
+    """The page opens without a ticked box: Fly was on, and a drag threw the scene out of view."""
+    none, counts = [False] * 3, "5 Gaussians, 2 cameras"
+    wanted = {
+        "": (none, 0, False, counts),
+        "#show=": (none, 0, False, counts),
+        "#fly=off&ui=on": (none, 0, False, counts),
+        "#fly=on": ([False, False, True], 0, False, counts),
+        "#camera=1&show=images&ui=off": ([False, True, False], 1, True, counts),
+        "#show=cameras,images": ([True, True, False], 0, False, counts),
+        "#camera=2": (none, 0, False, "camera=2;"),
+        "#camera=1x": (none, 0, False, "camera=1x;"),
+        "#camera=-1&show=fly": (none, 0, False, "camera=-1 and show=fly;"),
+        "#fly=yes&turn=on&ui=of": (none, 0, False, "fly=yes and turn=on and ui=of;"),
+    }
+    for (hash_, (boxes, camera, hidden, said)), found in zip(
+        wanted.items(), run(OPENED.replace("HASHES", json.dumps(list(wanted))[1:-1])), strict=True
+    ):
+        assert found[:3] == [boxes, camera, hidden], hash_
+        known = "camera=0 to camera=1, show=cameras,images, fly=on and ui=off."
+        refused = f"The page's address has {said} it takes {known}"
+        assert found[3] == (said if said == counts else refused), hash_
+
+
+def test_dragging_turns_around_what_the_middle_shows() -> None:
+    """100 px on a page of 900 x 600: the ball's middle stays where it was, the wall behind it does not count."""
+    scene = ball_before_a_wall()
+    gaussians, record = scene.gaussians, scene.initial().fields()
+    geometry = torch.cat(
+        (gaussians.means, gaussians.opacities[:, None], gaussians.quats, gaussians.scales, gaussians.means * 0), -1
+    )[:, :12]
+    page = {"settings": {"near": 0.01, "lowpass": 0.3}, "frustum_depth": 1}
+    pivot, *places = run(f"""
+        const canvas = {{ ...stub(), clientWidth: 900, clientHeight: 600, setPointerCapture() {{}} }}, on = {{}};
+        canvas.addEventListener = (name, action) => {{ on[name] = action; }};
+        const view = new View([0, -1, 0]), controls = new Controls(canvas, view, () => {{}}, {{}});
+        const where = () => {{
+          const local = view.axes.map((axis) => dot(axis, addScaled([0, 0, 4], view.center, -1)));
+          return [local[0] / local[2], local[1] / local[2], local[2]];
+        }};
+        view.set(fromRecord({json.dumps(record)}));
+        view.pivot = pivotDepth(view, new Float32Array({geometry.flatten().tolist()}), {json.dumps(page)});
+        answer = [view.pivot];
+        for (const [dx, dy] of [[100, 0], [-200, 0], [100, 100]]) {{
+          const event = {{ pointerId: 1, buttons: 1, clientX: 400, clientY: 300 }};
+          on.pointerdown(event);
+          on.pointermove({{ ...event, clientX: 400 + dx, clientY: 300 + dy }});
+          on.pointerup(event);
+          answer.push(where());
+        }}""")
+    assert pivot == pytest.approx(3.5, abs=0.3)  # the ball's near side
+    for x, y, depth in places:
+        assert abs(x) < 0.1
+        assert abs(y) < 0.1
+        assert depth == pytest.approx(4, abs=0.3)
