@@ -29,7 +29,7 @@ from vg2gt.data.synthetic.synthetic_scene import SyntheticScene, level_poses
 from vg2gt.data.transforms import from_bytes
 from vg2gt.io.files import read_json, write_json
 from vg2gt.metrics import psnr
-from vg2gt.reconstruction.monitor import Monitor
+from vg2gt.monitor import Monitor
 from vg2gt.reconstruction.pipeline import reconstruct_with
 from vg2gt.reconstruction.scene import Scene, render_views
 from vg2gt.runs.load import LoadedModel, load_model

@@ -19,14 +19,14 @@ from torch import Tensor
 
 from vg2gt.data.sources.colmap_model import model_folder_of
 from vg2gt.geometry.cameras import project
+from vg2gt.inputs.given_cameras import LAYOUTS, given_pictures
+from vg2gt.inputs.inputs import load_views, working_size
+from vg2gt.inputs.pictures import find_pictures
+from vg2gt.inputs.sfm import find_cameras
 from vg2gt.io import colmap_from_views, read_colmap, write_colmap
 from vg2gt.io.files import read_json
 from vg2gt.io.images import write_png
-from vg2gt.reconstruction.given_cameras import LAYOUTS, given_pictures
-from vg2gt.reconstruction.inputs import load_views, working_size
-from vg2gt.reconstruction.monitor import Monitor
-from vg2gt.reconstruction.pictures import find_pictures
-from vg2gt.reconstruction.sfm import find_cameras
+from vg2gt.monitor import Monitor
 from vg2gt.types import Cameras
 
 if TYPE_CHECKING:

@@ -17,21 +17,40 @@ MAY_IMPORT: dict[str, set[str]] = {
     "io": {"geometry"},
     "data": BASICS,
     **dict.fromkeys(("rendering", "method", "losses", "metrics"), BASICS),
-    "uncertainty": {"method"} | BASICS,
-    "model": {"method", "backends"} | BASICS,
-    "baselines": {"model", "method", "backends"} | BASICS,
-    "runs": {"uncertainty", "baselines", "model", "method", "rendering", "data"} | BASICS,
+    "visibility": BASICS,
+    "uncertainty": {"visibility"} | BASICS,
+    "model": {"visibility", "method", "backends"} | BASICS,
+    "baselines": {"visibility", "model", "method", "backends"} | BASICS,
+    "runs": {"visibility", "uncertainty", "baselines", "model", "method", "rendering", "data"} | BASICS,
     "viewer": {"rendering"} | BASICS,
-    "refinement": {"losses", "metrics", "rendering", "method"} | BASICS,
-    "evaluation": {"uncertainty", "refinement", "runs", "model", "rendering", "metrics", "data"} | BASICS,
-    "reconstruction": {"uncertainty", "refinement", "runs", "model", "method", "rendering", "data"} | BASICS,
+    "refinement": {"visibility", "losses", "metrics", "rendering", "method"} | BASICS,
+    "evaluation": {"visibility", "uncertainty", "refinement", "runs", "model", "rendering", "metrics", "data"} | BASICS,
+    "monitor": set(),
+    "inputs": {"monitor", "model", "data"} | BASICS,
+    "reconstruction": {
+        "monitor",
+        "inputs",
+        "visibility",
+        "uncertainty",
+        "refinement",
+        "runs",
+        "model",
+        "method",
+        "rendering",
+        "data",
+    }
+    | BASICS,
+    "outputs": {"monitor", "inputs", "reconstruction", "visibility", "rendering"} | BASICS,
     "training": {"evaluation", "runs", "model", "losses", "rendering", "data", "backends"} | BASICS,
     "studies": {"training", "evaluation", "runs"} | BASICS,
     "cli": {
         "studies",
         "training",
         "evaluation",
+        "monitor",
+        "inputs",
         "reconstruction",
+        "outputs",
         "refinement",
         "viewer",
         "runs",
@@ -40,6 +59,11 @@ MAY_IMPORT: dict[str, set[str]] = {
         "backends",
     }
     | BASICS,
+}
+# A scene saves itself, and images are added to a saved scene.
+UPWARDS = {
+    "vg2gt.reconstruction.scene -> vg2gt.outputs.outputs",
+    "vg2gt.reconstruction.pipeline -> vg2gt.outputs.saved",
 }
 OF_BACKENDS = ("vg2gt.types", "vg2gt.geometry", "vg2gt.io.tensors", "vg2gt.io.files", "vg2gt.kernels.compiled")
 
@@ -97,7 +121,7 @@ def test_imports_go_one_way() -> None:
             continue
         allowed = set() if here in LEAVES else {here, *LEAVES, *MAY_IMPORT[here]}
         wrong += [f"{module} -> {other}" for other in imported if room(other) not in allowed and other != "vg2gt"]
-    assert not wrong
+    assert set(wrong) == UPWARDS
 
 
 def test_rooms_go_one_way() -> None:
@@ -125,7 +149,7 @@ def test_data_and_reconstruction_are_imported_without_lightning() -> None:
     code = """
 import sys, vg2gt.data, vg2gt.data.sources
 assert not {"lightning", "hydra"} & set(sys.modules)
-import vg2gt.reconstruction, vg2gt.reconstruction.outputs
+import vg2gt.reconstruction.scene, vg2gt.outputs.outputs
 assert "lightning" not in sys.modules
 """
     subprocess.run([sys.executable, "-c", code], check=True)

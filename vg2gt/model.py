@@ -26,9 +26,9 @@ from backends.cache import TokenCache
 from vg2gt.geometry.alignment import fit_depth_scale
 from vg2gt.geometry.cameras import focal_lengths, relative_to_first, scale_translations
 from vg2gt.memory import note_sizes
-from vg2gt.method.additions.visibility import Support, ViewCheck
 from vg2gt.profiling import stage
 from vg2gt.types import Cameras, Decoded, Gaussians, Geometry, Hints, Prediction, Tokens, Voxels, check_choice
+from vg2gt.visibility import Support, ViewCheck
 
 Background = Literal["mean", "black"]
 ScaleSource = Literal["metric", "focal", "normalize", "groundtruth"]

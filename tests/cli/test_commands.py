@@ -157,7 +157,7 @@ def test_an_interrupted_command_says_so(said: Said, monkeypatch: pytest.MonkeyPa
         raise KeyboardInterrupt
 
     monkeypatch.setattr("vg2gt.io.read_gaussians", interrupted)
-    monkeypatch.setattr("vg2gt.reconstruction.camera_files.read_cameras", lambda path: [path])
+    monkeypatch.setattr("vg2gt.inputs.camera_files.read_cameras", lambda path: [path])
     assert said("render", "scene.ply", "--cameras", "c.json", "--out", "x") == (130, "interrupted\n")
 
 

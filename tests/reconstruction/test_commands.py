@@ -12,9 +12,9 @@ from PIL import Image
 
 from vg2gt.cli import reconstruct as reconstruct_command
 from vg2gt.cli import render as render_command
+from vg2gt.inputs.camera_files import interpolate
 from vg2gt.io import read_cameras_json, read_gaussian_ply, write_cameras_json
 from vg2gt.io.video import count_frames
-from vg2gt.reconstruction.camera_files import interpolate
 from vg2gt.reconstruction.scene import Scene
 
 TINY = ["backend=da3_tiny", "--size", "70", "--quiet", "--device", "cpu"]

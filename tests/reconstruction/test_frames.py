@@ -10,14 +10,14 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from tests.inputs.test_given_cameras import put_cameras, put_colmap
 from tests.reconstruction.conftest import SIZE, run
-from tests.reconstruction.test_given_cameras import put_cameras, put_colmap
 from vg2gt import io
 from vg2gt.geometry.cameras import project
+from vg2gt.inputs.given_cameras import given_pictures
+from vg2gt.outputs.saved import read_scene
 from vg2gt.reconstruction.frame import upright_rotation
-from vg2gt.reconstruction.given_cameras import given_pictures
 from vg2gt.reconstruction.pipeline import reconstruct_with
-from vg2gt.reconstruction.saved import read_scene
 from vg2gt.rendering import Renderer
 
 
@@ -95,7 +95,7 @@ def test_output_in_the_photographs_folder_does_not_become_input(folder: Path, fr
     ]
     shutil.rmtree(folder / "sparse")
     asked = []
-    monkeypatch.setattr("vg2gt.reconstruction.cameras.find_cameras", lambda *_: asked.append(1) or found)
+    monkeypatch.setattr("vg2gt.inputs.cameras.find_cameras", lambda *_: asked.append(1) or found)
     for number in (1, 2):
         run(folder / "images", "--out", folder / "images", "--save", "cameras.json", "--overwrite")
         assert len(asked) == number

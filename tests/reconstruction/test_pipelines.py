@@ -10,19 +10,19 @@ import pytest
 import torch
 from PIL import Image
 
+from tests.inputs.test_given_cameras import NAMES, put_cameras, put_colmap, put_transforms
 from tests.reconstruction.conftest import SIZE, run
-from tests.reconstruction.test_given_cameras import NAMES, put_cameras, put_colmap, put_transforms
 from vg2gt import io
 from vg2gt.cli import reconstruct as reconstruct_command
 from vg2gt.cli import render as render_command
-from vg2gt.reconstruction.camera_files import read_cameras
-from vg2gt.reconstruction.cameras import pictures_for
-from vg2gt.reconstruction.given_cameras import given_pictures
-from vg2gt.reconstruction.inputs import load_views, working_order, working_size
-from vg2gt.reconstruction.monitor import Monitor
-from vg2gt.reconstruction.pictures import find_pictures
+from vg2gt.inputs.camera_files import read_cameras
+from vg2gt.inputs.cameras import pictures_for
+from vg2gt.inputs.given_cameras import given_pictures
+from vg2gt.inputs.inputs import load_views, working_order, working_size
+from vg2gt.inputs.pictures import find_pictures
+from vg2gt.monitor import Monitor
+from vg2gt.outputs.saved import read_scene
 from vg2gt.reconstruction.pipeline import reconstruct_with
-from vg2gt.reconstruction.saved import read_scene
 from vg2gt.rendering import Renderer
 from vg2gt.runs.load import load_model
 from vg2gt.types import Gaussians
@@ -80,7 +80,7 @@ def test_a_model_that_cannot_be_read_is_said_where_others_are_found(model, folde
     put_colmap(folder, frames)
     path = folder / "sparse" / "0" / "images.bin"
     path.write_bytes(path.read_bytes()[:100])
-    monkeypatch.setattr("vg2gt.reconstruction.cameras.find_cameras", lambda pictures, *_: pictures)
+    monkeypatch.setattr("vg2gt.inputs.cameras.find_cameras", lambda pictures, *_: pictures)
     with pictures_for(model, folder):
         assert "cannot use the camera files, running structure from motion instead:" in caplog.text
         assert "images.bin" in caplog.text

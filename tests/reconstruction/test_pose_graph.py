@@ -12,8 +12,8 @@ from tests.data.sources.layout_rgbd import write_recording
 from vg2gt.data.base import Frames
 from vg2gt.geometry.alignment import align_points
 from vg2gt.geometry.cameras import camera_centers, invert_rigid, ray_directions, rigid_motions, scale_translations
-from vg2gt.reconstruction.given_cameras import given_pictures
-from vg2gt.reconstruction.monitor import Monitor
+from vg2gt.inputs.given_cameras import given_pictures
+from vg2gt.monitor import Monitor
 from vg2gt.reconstruction.windows.placement import Found, closes, loop_candidates, place_found, place_windows
 from vg2gt.reconstruction.windows.run import WindowRun, found_of
 from vg2gt.runs.load import load_model

@@ -13,7 +13,7 @@ import torch
 from vg2gt.cli import main
 from vg2gt.cli.reconstruct import _refinement
 from vg2gt.io import read_cameras_json, read_gaussian_ply, write_cameras_json
-from vg2gt.reconstruction.saved import near_of, read_scene
+from vg2gt.outputs.saved import near_of, read_scene
 from vg2gt.reconstruction.scene import Scene
 from vg2gt.refinement import RefineOptions, RefineRates
 from vg2gt.rendering import Renderer

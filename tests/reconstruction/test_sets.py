@@ -13,7 +13,7 @@ from tests.reconstruction.test_windows import BY_ITSELF, built
 from vg2gt.cli import reconstruct as command
 from vg2gt.data import SyntheticScenes
 from vg2gt.io import read_cameras_json, read_gaussian_ply
-from vg2gt.reconstruction.monitor import Monitor
+from vg2gt.monitor import Monitor
 from vg2gt.reconstruction.pipeline import add_images, take_out
 from vg2gt.reconstruction.windows.run import gaussians_of
 from vg2gt.reconstruction.windows.store import finished_sets, read_anchor, tidy
@@ -112,7 +112,7 @@ def test_taking_out_can_be_repeated_until_the_scene_is_written(parts, tmp_path, 
     with pytest.raises(SystemExit, match="--size, --drop cannot be combined with --add or --take-out"):
         command.main(["--take-out", str(tmp_path / "scene"), "--drop", "guessed", "--size", "56", *rest])
     with monkeypatch.context() as patch:
-        patch.setattr("vg2gt.reconstruction.outputs.write_outputs", full)
+        patch.setattr("vg2gt.outputs.outputs.write_outputs", full)
         with pytest.raises(SystemExit, match="disk full"):
             command.main(["--take-out", str(tmp_path / "scene"), *rest])
     with pytest.raises(SystemExit, match="was interrupted: repeat it first"):

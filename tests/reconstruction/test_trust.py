@@ -14,17 +14,18 @@ from vg2gt.cli import view as view_command
 from vg2gt.geometry.cameras import unproject
 from vg2gt.io import read_gaussian_ply, write_gaussian_ply
 from vg2gt.io.ply import read_properties
-from vg2gt.reconstruction.outputs import write_outputs
+from vg2gt.outputs.outputs import write_outputs
+from vg2gt.outputs.saved import read_scene
 from vg2gt.reconstruction.pipeline import reconstruct_with
-from vg2gt.reconstruction.saved import read_scene
 from vg2gt.reconstruction.scene import Scene
 from vg2gt.reconstruction.trust import pixel_trust, trust_line, trust_picture, trusted
 from vg2gt.rendering import Renderer
 from vg2gt.runs import load
 from vg2gt.types import Cameras, Geometry, Prediction
-from vg2gt.uncertainty import LEVELS, Calibration, Status
+from vg2gt.uncertainty import LEVELS, Calibration
 from vg2gt.uncertainty.calibration import MEASURED, Curve
-from vg2gt.uncertainty.evidence import EVIDENCE
+from vg2gt.visibility import Status
+from vg2gt.visibility.evidence import EVIDENCE
 
 
 @pytest.fixture(scope="module")

@@ -16,8 +16,8 @@ from tests.reconstruction.by_itself import ByHeart, ByItself
 from vg2gt.cli import reconstruct as command
 from vg2gt.data import SyntheticScenes
 from vg2gt.geometry.alignment import align_cameras
+from vg2gt.inputs.given_cameras import given_pictures
 from vg2gt.metrics import psnr
-from vg2gt.reconstruction.given_cameras import given_pictures
 from vg2gt.reconstruction.pipeline import reconstruct_with
 from vg2gt.reconstruction.windows import run as windows_run
 from vg2gt.reconstruction.windows import store

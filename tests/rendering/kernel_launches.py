@@ -24,8 +24,8 @@ from triton import knobs  # pyright: ignore[reportMissingImports]
 from triton.backends.compiler import GPUTarget  # pyright: ignore[reportMissingImports]
 
 from tests.rendering.scenes import cameras_around, floats_to, soup, with_gradients
-from vg2gt.kernels.render_gpu import kernels
 from vg2gt.rendering import Renderer
+from vg2gt.rendering.gpu import kernels
 
 TARGETS = {
     "sm_80": GPUTarget("cuda", 80, 32),

@@ -42,7 +42,7 @@ def test_a_step_is_a_few_launches_and_one_wait_whatever_the_views(benchmark_scri
 
 def test_many_refused_slots_do_not_overflow_their_sum() -> None:
     """One bad camera seen by ten million Gaussians: with 2^40 a slot the sum was negative, and memory was asked for."""
-    from vg2gt.kernels.render_gpu.projection import REFUSED, SLOTS
+    from vg2gt.rendering.gpu.projection import REFUSED, SLOTS
     from vg2gt.rendering.gpu_tiles import RefusedError, render_triton
 
     assert SLOTS * REFUSED < 1 << 63

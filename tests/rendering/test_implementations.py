@@ -21,8 +21,8 @@ from tests.rendering.scenes import (
     wall,
     with_gradients,
 )
-from vg2gt.kernels.render_cpu import tiles
 from vg2gt.rendering import cpu_tiles, render
+from vg2gt.rendering.cpu import tiles
 from vg2gt.rendering.options import DepthKind, Mode
 from vg2gt.rendering.renderer import Implementation
 

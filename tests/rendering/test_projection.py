@@ -4,7 +4,7 @@ import torch
 
 from tests.rendering.scenes import cameras_around, pinhole, soup
 from vg2gt.geometry.rotations import quat_to_matrix
-from vg2gt.kernels.constants import ALPHA_MIN
+from vg2gt.rendering.constants import ALPHA_MIN
 from vg2gt.rendering.options import RenderOptions
 from vg2gt.rendering.projection import Splats, project, respond, screen_box
 from vg2gt.rendering.scenes import SceneViews

@@ -43,7 +43,7 @@ def test_right_kernels_agree_far_within_the_bounds(mode: Mode, tmp_path: Path, m
 @interpreted
 def test_wrong_kernels_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A Gaussian's gradient is the sum of one row a tile; additions without atomics would keep one of them."""
-    from vg2gt.kernels.render_gpu import kernels
+    from vg2gt.rendering.gpu import kernels
 
     source = Path(kernels.__file__).with_name("projection_backward.py").read_text()
     right = "most = tl.max(count, 0)"

@@ -8,9 +8,10 @@ import torch
 
 from vg2gt.evaluation.scene_metrics import ause
 from vg2gt.io.errors import FormatError
-from vg2gt.uncertainty import LEVELS, Calibration, Samples, Status, calibrate, read_calibration
+from vg2gt.uncertainty import LEVELS, Calibration, Samples, calibrate, read_calibration
 from vg2gt.uncertainty.calibration import MEASURED
-from vg2gt.uncertainty.evidence import EVIDENCE
+from vg2gt.visibility import Status
+from vg2gt.visibility.evidence import EVIDENCE
 
 
 def pixels(seed: int, scenes: int = 20, each: int = 8000, useful: bool = True) -> Samples:

@@ -4,10 +4,10 @@ import pytest
 import torch
 
 from tests.voxels.conftest import room
-from vg2gt.method.additions.visibility import ViewCheck
-from vg2gt.method.additions.visibility import check as check_module
-from vg2gt.method.additions.visibility.blocks import check_blocks, coarsening, neighbourhood
-from vg2gt.method.additions.visibility.check import choose_partners
+from vg2gt.visibility import ViewCheck
+from vg2gt.visibility import check as check_module
+from vg2gt.visibility.blocks import check_blocks, coarsening, neighbourhood
+from vg2gt.visibility.check import choose_partners
 
 
 @pytest.mark.parametrize("many", [100, 5])

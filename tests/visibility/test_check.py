@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from tests.visibility.test_counts import SIZE, sideways
-from vg2gt.method.additions.visibility import ViewCheck
 from vg2gt.types import Cameras, Geometry
+from vg2gt.visibility import ViewCheck
 
 
 def geometry(depth: torch.Tensor, cameras: Cameras) -> Geometry:

@@ -5,9 +5,9 @@ import torch
 from torch import Tensor
 
 from vg2gt.geometry.cameras import rigid_motions
-from vg2gt.method.additions.visibility import ViewCheck, check, choose_partners, count_views
-from vg2gt.method.additions.visibility.counts import count_views_reference
 from vg2gt.types import Cameras, Geometry
+from vg2gt.visibility import ViewCheck, check, choose_partners, count_views
+from vg2gt.visibility.counts import count_views_reference
 
 SIZE = (20, 28)
 INTRINSICS = torch.tensor([[25.0, 0.0, 13.5], [0.0, 25.0, 9.5], [0.0, 0.0, 1.0]])

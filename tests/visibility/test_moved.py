@@ -10,8 +10,8 @@ from examples.worlds.moving import SyntheticMovingRoom
 from tests.visibility.test_check import geometry, wall
 from tests.visibility.test_counts import SIZE, sideways
 from vg2gt.config import compose
-from vg2gt.method.additions.visibility import ViewCheck
 from vg2gt.types import Cameras, Geometry, Hints
+from vg2gt.visibility import ViewCheck
 
 TIME = torch.arange(7)[None]
 

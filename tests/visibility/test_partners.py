@@ -6,8 +6,8 @@ import torch
 
 from tests.visibility.test_counts import SIZE, cameras, sideways
 from vg2gt.geometry.cameras import rigid_motions
-from vg2gt.method.additions.visibility import choose_partners
 from vg2gt.types import Cameras
+from vg2gt.visibility import choose_partners
 
 
 def ring(views: int) -> Cameras:

@@ -16,10 +16,10 @@ from backends.network import normalize_images
 from vg2gt.baselines.pixels import SMALLEST_FOOTPRINT, PixelReconstructor, Pixels, ReadViews
 from vg2gt.geometry.precision import full_precision
 from vg2gt.geometry.rotations import matrix_to_quat, multiply_quats
-from vg2gt.method.additions.visibility import ViewCheck
 from vg2gt.method.gaussian_head import harmonic_gains
 from vg2gt.model import Background, SceneScale
 from vg2gt.types import Cameras, Gaussians, Geometry, Hints, Tokens
+from vg2gt.visibility import ViewCheck
 
 MIN_SCALE, MAX_SCALE = 1e-5, 30.0  # in SCALE_UNIT times the sum of a pixel's sides
 SCALE_UNIT = 0.1

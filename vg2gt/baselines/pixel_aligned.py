@@ -14,11 +14,11 @@ from vg2gt.baselines.pixels import PixelReconstructor, Pixels, ReadViews
 from vg2gt.geometry.rotations import matrix_to_quat, multiply_quats
 from vg2gt.geometry.spherical_harmonics import MAX_DEGREE, rgb_to_sh
 from vg2gt.method import DenseHead
-from vg2gt.method.additions.visibility import ViewCheck
 from vg2gt.method.gaussian_head import harmonic_gains
 from vg2gt.method.grid import VoxelPlan, in_range, plan_voxels, point_cells, pool_mean, scene_voxel_size
 from vg2gt.model import Background, SceneScale
 from vg2gt.types import Gaussians, Tokens
+from vg2gt.visibility import ViewCheck
 
 MAX_SCALE = 4.0  # footprints
 MIN_SCALE = 1e-2  # footprints: renderers need a finite inverse

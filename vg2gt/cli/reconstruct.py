@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 from vg2gt.cli.arguments import OVERRIDES, add_common_flags, flag_parser, list_of_names, listing, separate
 from vg2gt.cli.errors import errors_in_one_line
 from vg2gt.cli.refine import options_for
-from vg2gt.reconstruction.output_names import DEFAULT, LARGE, OUTPUTS, PREDICTED, SFM, TILES, WINDOWS
+from vg2gt.outputs.output_names import DEFAULT, LARGE, OUTPUTS, PREDICTED, SFM, TILES
+from vg2gt.reconstruction.windows import WINDOWS
 
 POSES = (
     "cameras from files next to the images, or from structure from motion (kept in DIR/sfm); auto: the first of these "
@@ -27,7 +28,7 @@ WINDOW = (
 REFINE = "steps of refinement on the images; default: 400 for photographs, 0 for RGB-D recordings; 0: feed-forward"
 
 if TYPE_CHECKING:
-    from vg2gt.reconstruction.monitor import Monitor
+    from vg2gt.monitor import Monitor
     from vg2gt.reconstruction.scene import Scene
     from vg2gt.refinement import RefineOptions
     from vg2gt.runs.load import LoadedModel
@@ -66,8 +67,8 @@ def main(argv: Sequence[str] | None = None) -> None:
 def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     """Reconstructs a scene and writes the outputs."""
     from vg2gt.memory import RECONSTRUCTION, memory_advice
-    from vg2gt.reconstruction.monitor import Monitor
-    from vg2gt.reconstruction.outputs import cost_figures, write_outputs
+    from vg2gt.monitor import Monitor
+    from vg2gt.outputs.outputs import cost_figures, write_outputs
     from vg2gt.reconstruction.refined import refine_scene, refinement_lines
     from vg2gt.reconstruction.trust import trust_line, trusted
     from vg2gt.reconstruction.windows.store import remove, tidy
@@ -121,9 +122,9 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
 
 def _check(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     """Checks all arguments before weights are downloaded or any work is done."""
-    from vg2gt.reconstruction.cameras import check_inputs
-    from vg2gt.reconstruction.outputs import check_folder, check_outputs
-    from vg2gt.reconstruction.pictures import check_limit
+    from vg2gt.inputs.cameras import check_inputs
+    from vg2gt.inputs.pictures import check_limit
+    from vg2gt.outputs.outputs import check_folder, check_outputs
     from vg2gt.reconstruction.trust import check_trust
     from vg2gt.reconstruction.windows.store import window_size
     from vg2gt.runs.load import backend_class

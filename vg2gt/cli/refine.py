@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from vg2gt.cli.arguments import add_common_flags, flag_parser, listing, separate
 from vg2gt.cli.errors import errors_in_one_line
-from vg2gt.reconstruction.output_names import DEFAULT, OUTPUTS
+from vg2gt.outputs.output_names import DEFAULT, OUTPUTS
 
 if TYPE_CHECKING:
     from vg2gt.reconstruction.scene import Scene
@@ -41,10 +41,10 @@ def main(argv: Sequence[str] | None = None) -> None:
 def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     """Refines a scene and writes the outputs."""
     from vg2gt.memory import memory_advice
-    from vg2gt.reconstruction.monitor import Monitor
-    from vg2gt.reconstruction.outputs import check_folder, check_outputs, write_outputs
+    from vg2gt.monitor import Monitor
+    from vg2gt.outputs.outputs import check_folder, check_outputs, write_outputs
+    from vg2gt.outputs.saved import read_scene
     from vg2gt.reconstruction.refined import refine_scene, refinement_lines
-    from vg2gt.reconstruction.saved import read_scene
     from vg2gt.rendering import Renderer
     from vg2gt.runs.load import choose_device
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from vg2gt.cli.arguments import add_common_flags, flag_parser, listing
 from vg2gt.cli.errors import errors_in_one_line
-from vg2gt.reconstruction.output_names import FPS, MAPS
+from vg2gt.outputs.output_names import FPS, MAPS
 
 OUTPUTS = {**MAPS, "video.gif": "the colour of all views as an animation", "video.mp4": "the same as H.264"}
 DEFAULT = ("color.png",)
@@ -38,12 +38,12 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Renders the views and writes the outputs."""
+    from vg2gt.inputs.camera_files import interpolate, read_cameras
     from vg2gt.io import read_gaussians
     from vg2gt.io.video import require_pyav
-    from vg2gt.reconstruction.camera_files import interpolate, read_cameras
-    from vg2gt.reconstruction.monitor import Monitor
-    from vg2gt.reconstruction.outputs import animation, check_folder, check_outputs, cost_figures, feed, map_folder
-    from vg2gt.reconstruction.saved import near_of
+    from vg2gt.monitor import Monitor
+    from vg2gt.outputs.outputs import animation, check_folder, check_outputs, cost_figures, feed, map_folder
+    from vg2gt.outputs.saved import near_of
     from vg2gt.reconstruction.scene import render_views
     from vg2gt.rendering import Renderer
     from vg2gt.runs.load import choose_device

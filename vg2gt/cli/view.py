@@ -45,9 +45,9 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Reads the scene, writes the page and opens it if asked."""
+    from vg2gt.inputs.camera_files import read_cameras
     from vg2gt.io import read_gaussians
-    from vg2gt.reconstruction.camera_files import read_cameras
-    from vg2gt.reconstruction.saved import near_of
+    from vg2gt.outputs.saved import near_of
     from vg2gt.rendering import Renderer
     from vg2gt.viewer import ViewerScene, scene_title, write_viewer_html
 

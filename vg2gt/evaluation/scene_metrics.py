@@ -18,7 +18,8 @@ from vg2gt.metrics import (
     ssim,
 )
 from vg2gt.types import Batch, Cameras, Decoded, Geometry, Render
-from vg2gt.uncertainty import LEVELS, Samples, pixel_evidence
+from vg2gt.uncertainty import LEVELS, Samples
+from vg2gt.visibility import pixel_evidence
 
 SHARES = 20  # steps of the sparsification curve
 

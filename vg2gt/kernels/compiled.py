@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 
 PACKAGES = Path(__file__).resolve().parents[2]
 SHARED = Path(__file__).with_name("compiled_math.py")
-"""The only module outside their own package (``vg2gt/kernels``) that kernels may import from; a test checks this."""
+"""The only module outside their room (such as ``vg2gt/kernels``) that kernels may import from, as a test checks."""
 VARIABLE = "NUMBA_CACHE_DIR"
 
 config: Any = numba.config  # pyright: ignore[reportPrivateImportUsage]

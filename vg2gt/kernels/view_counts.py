@@ -1,4 +1,4 @@
-"""The compiled count of :mod:`vg2gt.method.additions.visibility.counts`."""
+"""The compiled count of :mod:`vg2gt.visibility.counts`."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Reconstruction of scenes from images, and their export to files."""
+"""Reconstruction of scenes from images, all at once or in windows."""

@@ -14,19 +14,19 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from vg2gt.geometry.precision import half_precision_on_gpu
+from vg2gt.inputs.cameras import Poses, pictures_for
+from vg2gt.inputs.inputs import Views, as_given, in_order, load_views, source_of, working_order, working_size
+from vg2gt.inputs.pictures import SFM_SOURCE, ImagesLike, Picture, spread
 from vg2gt.io.files import by_number
 from vg2gt.memory import RECONSTRUCTION, memory_advice, note_sizes
 from vg2gt.method.additions.far_shell import far_shell
 from vg2gt.model import VG2GT, Reconstructor
-from vg2gt.reconstruction.cameras import Poses, pictures_for
+from vg2gt.monitor import Monitor
+from vg2gt.outputs.saved import read_scene
 from vg2gt.reconstruction.frame import first_frame, similarity_of
-from vg2gt.reconstruction.inputs import Views, as_given, in_order, load_views, source_of, working_order, working_size
-from vg2gt.reconstruction.monitor import Monitor
-from vg2gt.reconstruction.output_names import WINDOWS
-from vg2gt.reconstruction.pictures import SFM_SOURCE, ImagesLike, Picture, spread
-from vg2gt.reconstruction.saved import read_scene
 from vg2gt.reconstruction.scene import Scene
 from vg2gt.reconstruction.trust import pixel_trust
+from vg2gt.reconstruction.windows import WINDOWS
 from vg2gt.reconstruction.windows.run import WindowRun, device_of, gaussians_of, set_key, window_model
 from vg2gt.reconstruction.windows.store import (
     AUTOMATIC,
@@ -81,12 +81,12 @@ def reconstruct_with(
 
     Args:
         model: the model; it is put into eval mode.
-        images: see :func:`vg2gt.reconstruction.pictures.find_pictures`.
+        images: see :func:`vg2gt.inputs.pictures.find_pictures`.
         max_images: maximum number of images, evenly spread.
-        size: see :func:`vg2gt.reconstruction.inputs.working_size`.
+        size: see :func:`vg2gt.inputs.inputs.working_size`.
         renderer: renderer of the scene; None: solids, with the default options.
         monitor: shows and times the stages.
-        poses: source of the cameras, see :func:`vg2gt.reconstruction.cameras.pictures_for`.
+        poses: source of the cameras, see :func:`vg2gt.inputs.cameras.pictures_for`.
         sfm_folder: folder where cameras found by structure from motion are kept and reused; None: they are not kept.
         window: process this many images and their neighbours at a time, which bounds memory
             (:mod:`vg2gt.reconstruction.windows`); 0: all at once; None: 24 if there are more than 100, else all.
@@ -204,7 +204,7 @@ def add_images(
     Args:
         model: model that made the scene.
         folder: output folder of ``vg2gt reconstruct --keep-windows``.
-        images: see :func:`vg2gt.reconstruction.pictures.find_pictures`.
+        images: see :func:`vg2gt.inputs.pictures.find_pictures`.
         renderer: renderer of the scene.
         monitor: shows and times the stages.
         window: see :func:`reconstruct_with`.

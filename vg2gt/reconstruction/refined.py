@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from vg2gt.reconstruction.monitor import Monitor
+from vg2gt.monitor import Monitor
 from vg2gt.refinement import Observations, RefineOptions, refine
 
 if TYPE_CHECKING:

@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from vg2gt.geometry.cameras import unproject
+from vg2gt.inputs.inputs import photo_of
+from vg2gt.inputs.pictures import Picture
 from vg2gt.io.cameras_json import NamedCamera, named_cameras
 from vg2gt.reconstruction.frame import SceneFrame, move_to_target, moved_cameras
-from vg2gt.reconstruction.inputs import photo_of
-from vg2gt.reconstruction.pictures import Picture
 from vg2gt.refinement import Refined, RefineOptions
 from vg2gt.rendering import Renderer
 from vg2gt.types import Cameras, Gaussians
-from vg2gt.uncertainty import point_support
+from vg2gt.visibility import point_support
 
 POINTS = 100_000
 
@@ -82,7 +82,7 @@ class Scene:
         mask: ``[V, H, W]`` in [0, 1], weights of the input pixels; None: all count.
         pictures: source pictures, one per view; empty for a scene read from files.
         error: ``[V, H, W]`` relative error that the decoded depth stays below in 9 of 10 pixels; None: not stated.
-        support: ``[V, H, W]`` uint8 :class:`vg2gt.uncertainty.Status` of each pixel; None: unknown.
+        support: ``[V, H, W]`` uint8 :class:`vg2gt.visibility.Status` of each pixel; None: unknown.
         poses: ``[V, 4, 4]`` float64 ``world_to_camera``, if known more precisely than in ``cameras``.
     """
 
@@ -105,7 +105,7 @@ class Scene:
 
     @cached_property
     def gaussian_trust(self) -> dict[str, Tensor] | None:
-        """``support`` (:class:`vg2gt.uncertainty.Status`) and, if stated, ``error`` of the Gaussians, ``[G]`` each.
+        """``support`` (:class:`vg2gt.visibility.Status`) and, if stated, ``error`` of the Gaussians, ``[G]`` each.
 
         None if the support of the pixels is unknown, as for scenes made in windows.
         """
@@ -177,13 +177,13 @@ class Scene:
         return refine_scene(self, replace(options or RefineOptions(), **changes))
 
     def save(self, folder: str | Path, outputs: Sequence[str] = ("scene.ply", "cameras.json", "report.png")) -> None:
-        """Writes outputs into a folder; :data:`vg2gt.reconstruction.output_names.OUTPUTS` lists them.
+        """Writes outputs into a folder; :data:`vg2gt.outputs.output_names.OUTPUTS` lists them.
 
         Raises:
             FileExistsError: if an output exists.
             ValueError: if an output is unknown.
         """
-        from vg2gt.reconstruction.outputs import write_outputs
+        from vg2gt.outputs.outputs import write_outputs
 
         write_outputs(self, folder, outputs)
 

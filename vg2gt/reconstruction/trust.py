@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from vg2gt.types import Prediction
-from vg2gt.uncertainty import STATED, Calibration, Status, pixel_evidence
+from vg2gt.uncertainty import STATED, Calibration
+from vg2gt.visibility import Status, pixel_evidence
 
 if TYPE_CHECKING:
     from vg2gt.reconstruction.scene import Scene

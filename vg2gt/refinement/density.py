@@ -13,11 +13,11 @@ from vg2gt.geometry.rotations import matrix_to_quat, quat_to_matrix
 from vg2gt.geometry.spherical_harmonics import rgb_to_sh
 from vg2gt.method.additions.far_shell import is_far
 from vg2gt.method.additions.surfel import ALONE
-from vg2gt.method.additions.visibility import count_points
 from vg2gt.method.grid import plan_voxels, point_cells, pool_mean
 from vg2gt.refinement.options import Observations
 from vg2gt.rendering import Renderer
 from vg2gt.types import Cameras, Gaussians
+from vg2gt.visibility import count_points
 
 TOLERANCE, MARGIN = 0.03, 0.05  # relative depth differences at which a view agrees with a Gaussian, or looks through it
 FEWEST = 2  # minimum number of views that agree with Gaussians to merge

@@ -14,14 +14,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vg2gt.kernels.constants import CONVERGED, MEDIAN_MAX_TRANSMITTANCE, NEGLIGIBLE, TRANSMITTANCE_STOP
-from vg2gt.kernels.render_cpu import tiles
-from vg2gt.kernels.render_cpu.backward import backward_color, backward_rasterized, backward_solid
-from vg2gt.kernels.render_cpu.forward import forward_color, forward_rasterized, forward_solid
-from vg2gt.kernels.render_cpu.projection import BLOCK, project_block
-from vg2gt.kernels.render_cpu.projection_backward import CHUNK, FIELDS, project_backward_block
-from vg2gt.kernels.render_cpu.tiles import count_tiles, depth_order, fill_tiles
 from vg2gt.kernels.threads import parallel_for
+from vg2gt.rendering.constants import CONVERGED, MEDIAN_MAX_TRANSMITTANCE, NEGLIGIBLE, TRANSMITTANCE_STOP
+from vg2gt.rendering.cpu import tiles
+from vg2gt.rendering.cpu.backward import backward_color, backward_rasterized, backward_solid
+from vg2gt.rendering.cpu.forward import forward_color, forward_rasterized, forward_solid
+from vg2gt.rendering.cpu.projection import BLOCK, project_block
+from vg2gt.rendering.cpu.projection_backward import CHUNK, FIELDS, project_backward_block
+from vg2gt.rendering.cpu.tiles import count_tiles, depth_order, fill_tiles
 from vg2gt.rendering.median import depth_factors
 from vg2gt.rendering.options import RenderOptions
 from vg2gt.rendering.scenes import Images, SceneViews

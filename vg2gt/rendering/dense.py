@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from vg2gt.geometry.cameras import pixel_grid
-from vg2gt.kernels.constants import ALPHA_MIN, TRANSMITTANCE_STOP
+from vg2gt.rendering.constants import ALPHA_MIN, TRANSMITTANCE_STOP
 from vg2gt.rendering.median import ray_depth
 from vg2gt.rendering.options import RenderOptions
 from vg2gt.rendering.projection import Splats, respond, visible_splats

@@ -12,12 +12,18 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from vg2gt.kernels.constants import BRACKET_SIGMAS, CONVERGED, MEDIAN_MAX_TRANSMITTANCE, NEGLIGIBLE, TRANSMITTANCE_STOP
-from vg2gt.kernels.render_gpu import kernels as launchable
-from vg2gt.kernels.render_gpu.binning import ENTRIES
-from vg2gt.kernels.render_gpu.projection import BLOCK, REFUSED, SLOTS
-from vg2gt.kernels.render_gpu.projection_backward import CAMERA
-from vg2gt.kernels.render_gpu.tiles import RECORD, TILE
+from vg2gt.rendering.constants import (
+    BRACKET_SIGMAS,
+    CONVERGED,
+    MEDIAN_MAX_TRANSMITTANCE,
+    NEGLIGIBLE,
+    TRANSMITTANCE_STOP,
+)
+from vg2gt.rendering.gpu import kernels as launchable
+from vg2gt.rendering.gpu.binning import ENTRIES
+from vg2gt.rendering.gpu.projection import BLOCK, REFUSED, SLOTS
+from vg2gt.rendering.gpu.projection_backward import CAMERA
+from vg2gt.rendering.gpu.tiles import RECORD, TILE
 from vg2gt.rendering.options import RenderOptions
 from vg2gt.types import Cameras, Gaussians, Render
 

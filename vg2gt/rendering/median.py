@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from vg2gt.kernels.constants import BRACKET_SIGMAS, MEDIAN_MAX_TRANSMITTANCE
+from vg2gt.rendering.constants import BRACKET_SIGMAS, MEDIAN_MAX_TRANSMITTANCE
 from vg2gt.rendering.options import RenderOptions
 
 LOG_HALF = math.log(0.5)

@@ -22,7 +22,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from vg2gt.geometry.rotations import quat_to_matrix
-from vg2gt.kernels.constants import ALPHA_MIN, JACOBIAN_CLAMP
+from vg2gt.rendering.constants import ALPHA_MIN, JACOBIAN_CLAMP
 from vg2gt.rendering.options import RenderOptions
 from vg2gt.rendering.scenes import SceneViews
 

@@ -31,8 +31,7 @@ MODES: tuple[Mode, ...] = ("solid", "rasterized")
 SCENES, COUNT, SIZE, VIEWS, DEGREE = 2, 7, (9, 11), 2, 2  # COUNT: Gaussians per scene; DEGREE: as in model=vg2gt
 STREAM = 44  # seed of the scenes, with which three quarters of the rays have a well-conditioned depth
 ROWS = 8  # gradient rows held at once: fewer than a view has, so that views are processed one by one
-_VG2GT = Path(__file__).resolve().parents[1]
-SOURCES = [*sorted(_VG2GT.glob("kernels/render_gpu/*.py")), *sorted(_VG2GT.glob("rendering/*.py"))]
+SOURCES = [path for files in ("gpu/*.py", "*.py") for path in sorted(Path(__file__).parent.glob(files))]
 ADVICE = (
     "To render without these kernels (many times slower), use renderer.implementation=cpu (vg2gt reconstruct) "
     "or --device cpu (other commands)"

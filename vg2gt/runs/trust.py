@@ -20,9 +20,9 @@ from torch import nn
 from vg2gt.config import plugin_targets
 from vg2gt.data.base import SceneSource
 from vg2gt.io.files import regular
-from vg2gt.method.additions.visibility import ViewCheck
 from vg2gt.model import SceneScale
 from vg2gt.rendering import Renderer
+from vg2gt.visibility import ViewCheck
 
 ENVIRONMENT = "VG2GT_TRUST"
 OWN = ("vg2gt", "backends")
@@ -31,6 +31,9 @@ KINDS = (nn.Module, SceneSource, SceneScale, ViewCheck, Renderer)
 
 GONE = ("background", "compile", "drift", "provider")
 """Options that our backends had in former versions; no network depends on them."""
+
+MOVED = {"vg2gt.method.additions.visibility.": "vg2gt.visibility."}
+"""Former places of classes that runs of former versions name."""
 
 
 class UntrustedError(ValueError):
@@ -53,6 +56,8 @@ def read_run_config(path: str | Path) -> DictConfig:
 
 def parse_run_config(text: str, source: str | Path) -> DictConfig:
     """Parses an untrusted configuration; ``source`` names it in errors, which are those of :func:`read_run_config`."""
+    for former, now in MOVED.items():
+        text = text.replace(former, now)
     if "${" in text:  # an interpolation could read the environment
         raise UntrustedError(f"{source} holds an interpolation; a run's configuration must contain plain values only")
     try:

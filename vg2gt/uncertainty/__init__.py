@@ -1,16 +1,12 @@
-"""Uncertainty of a scene: a status and a calibrated error bound for every depth."""
+"""Calibrated error bounds of depth, from the evidence of :mod:`vg2gt.visibility`."""
 
 from vg2gt.uncertainty.calibration import LEVELS, STATED, Calibration, Samples, calibrate, read_calibration
-from vg2gt.uncertainty.evidence import Status, pixel_evidence, point_support
 
 __all__ = [
     "LEVELS",
     "STATED",
     "Calibration",
     "Samples",
-    "Status",
     "calibrate",
-    "pixel_evidence",
-    "point_support",
     "read_calibration",
 ]

@@ -24,7 +24,7 @@ from torch import Tensor
 from vg2gt.io.errors import FormatError
 from vg2gt.io.files import read_json, write_json
 from vg2gt.types import TensorRecord
-from vg2gt.uncertainty.evidence import EVIDENCE, Status
+from vg2gt.visibility.evidence import EVIDENCE, Status
 
 LEVELS = (0.5, 0.8, 0.9, 0.95)
 STATED = 0.9  # level of the bound called ``error``
@@ -43,8 +43,8 @@ class Samples(TensorRecord):
     """Pixels with a known error.
 
     Attributes:
-        evidence: ``[N, F]`` of :data:`vg2gt.uncertainty.evidence.EVIDENCE`.
-        status: ``[N]``, see :class:`vg2gt.uncertainty.evidence.Status`.
+        evidence: ``[N, F]`` of :data:`vg2gt.visibility.evidence.EVIDENCE`.
+        status: ``[N]``, see :class:`vg2gt.visibility.evidence.Status`.
         error: ``[N]`` error relative to the decoded depth.
         scene: ``[N]`` int64 scene index of each pixel.
     """

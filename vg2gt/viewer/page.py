@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from vg2gt.io.files import write_text
 from vg2gt.io.gaussian_arrays import to_arrays
 from vg2gt.io.images import encode_image
-from vg2gt.kernels.constants import ALPHA_MIN, JACOBIAN_CLAMP
+from vg2gt.rendering.constants import ALPHA_MIN, JACOBIAN_CLAMP
 from vg2gt.rendering.options import RenderOptions
 from vg2gt.types import Gaussians
 from vg2gt.viewer.content import ViewerScene

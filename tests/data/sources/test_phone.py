@@ -10,8 +10,8 @@ import torch
 from PIL import Image
 
 from vg2gt.data import DataError, RGBDFolder
-from vg2gt.reconstruction.given_cameras import given_pictures
-from vg2gt.reconstruction.pictures import find_pictures
+from vg2gt.inputs.given_cameras import given_pictures
+from vg2gt.inputs.pictures import find_pictures
 
 from .layout_phone import write_polycam, write_r3d
 from .layouts import SIZE, room, save

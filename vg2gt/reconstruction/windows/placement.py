@@ -16,9 +16,9 @@ from torch import Tensor
 
 from vg2gt.geometry.alignment import Similarity, align_cameras, fit_depth_scale, weighted_median
 from vg2gt.geometry.cameras import camera_centers, relative_to_first
-from vg2gt.method.additions.visibility.counts import count_views
 from vg2gt.reconstruction.windows.store import Window
 from vg2gt.types import Cameras
+from vg2gt.visibility.counts import count_views
 
 PARAMETERS = 7  # per window: log scale, rotation vector, translation
 OUTLIER = 0.1  # residual (relative, rad, window depths) beyond which an edge is down-weighted

@@ -13,17 +13,15 @@ from torch import Tensor
 
 from vg2gt.geometry.cameras import crop_intrinsics, scale_translations
 from vg2gt.geometry.precision import half_precision_on_gpu
+from vg2gt.inputs.inputs import thumbnails, working_order
+from vg2gt.inputs.pictures import Picture, mask_file
 from vg2gt.io.files import write_json
 from vg2gt.io.tensors import read_tensors
 from vg2gt.memory import note_sizes
-from vg2gt.method.additions.visibility.blocks import check_blocks, coarsening
-from vg2gt.method.additions.visibility.check import choose_partners
 from vg2gt.method.fine import FineModule
 from vg2gt.method.grid import scene_voxel_size
 from vg2gt.model import VG2GT, Reconstructor, background_sums
-from vg2gt.reconstruction.inputs import thumbnails, working_order
-from vg2gt.reconstruction.monitor import Monitor
-from vg2gt.reconstruction.pictures import Picture, mask_file
+from vg2gt.monitor import Monitor
 from vg2gt.reconstruction.windows.placement import (
     Found,
     closes,
@@ -46,6 +44,8 @@ from vg2gt.reconstruction.windows.store import (
     merge_windows,
 )
 from vg2gt.types import Cameras, Gaussians, Geometry, Tokens
+from vg2gt.visibility.blocks import check_blocks, coarsening
+from vg2gt.visibility.check import choose_partners
 
 TOKEN_BYTES = 4e9  # maximum size of all windows' tokens on disk; if larger, the backbone runs a second time instead
 REDUCED = 4  # pixel stride of the depth that places windows

@@ -22,14 +22,14 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from vg2gt.inputs.inputs import depth_range, given_poses, load_views, map_shift, source_of
+from vg2gt.inputs.pictures import Picture
 from vg2gt.io.errors import FormatError
 from vg2gt.io.files import read_json, replacing, write_json
 from vg2gt.io.tensors import read_tensors
 from vg2gt.method.pooled import PooledVoxels, concatenate, merge
 from vg2gt.model import Reconstructor
-from vg2gt.reconstruction.inputs import depth_range, given_poses, load_views, map_shift, source_of
-from vg2gt.reconstruction.monitor import Monitor
-from vg2gt.reconstruction.pictures import Picture
+from vg2gt.monitor import Monitor
 from vg2gt.types import Cameras, Hints
 
 FORMAT = 2

@@ -1,0 +1,103 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from vg2gt.inputs import pictures
+from vg2gt.inputs.inputs import load_views, working_size
+from vg2gt.inputs.pictures import Picture, find_pictures, shrunk, with_unique_names
+from vg2gt.io import read_video, video, write_video
+from vg2gt.monitor import Monitor
+
+
+def _views(images):
+    return load_views(find_pictures(images), (84, 112), Monitor())
+
+
+def test_photographs_of_all_sizes_come_upright_in_the_order_of_their_numbers(photos: Path, frames) -> None:
+    views = _views(photos)
+    assert views.names == ("IMG_8", "IMG_9", "IMG_10", "IMG_11")
+    assert torch.equal(views.images[0], frames.images[0])
+    for i in (1, 2):  # JPEG, resized or turned
+        assert (views.images[i] - frames.images[i]).abs().mean() < 0.03
+    assert views.hints.cameras is None
+    assert views.hints.frame_ids.tolist() == [list(range(len(views.names)))]
+
+
+def test_order_and_mixture_of_arguments_are_kept(photos: Path, frames) -> None:
+    given = [frames.images[3], photos / "IMG_9.jpg", Image.open(photos / "IMG_10.jpg"), frames.images[:2]]
+    views = _views(given)
+    assert views.names == ("image-000", "IMG_9", "image-001", "image-002", "image-003")
+    assert (views.images[2] - frames.images[2]).abs().mean() < 0.03  # the Pillow image's EXIF data count too
+    assert torch.allclose(views.images[[0, 3, 4]], frames.images[[3, 0, 1]], atol=1 / 500)
+
+
+def test_frames_of_a_video(tmp_path: Path) -> None:
+    frames = [np.zeros((20, 70, 3), np.uint8) for _ in range(70)]
+    for i, frame in enumerate(frames):
+        frame[:, :i] = 255
+    path = write_video(tmp_path / "clip.gif", frames)
+    assert len(find_pictures(path)) == 32
+    chosen = find_pictures(path, max_images=3)
+    assert [p.name for p in chosen] == ["clip-000000", "clip-000034", "clip-000069"]
+    assert chosen[2].read((14, 14)).images.mean().item() == pytest.approx(69 / 70, abs=0.02)
+    mixed = find_pictures([frames[0], path, frames[1]], max_images=3)
+    assert [p.name for p in mixed] == ["image-000", "clip-000034", "image-001"]
+
+
+def test_a_reduced_photograph_fits_its_camera() -> None:
+    ramp = np.tile(np.arange(0, 250, 2, np.uint8)[:, None], (81, 1, 3))
+    small = shrunk(ramp, (20, 31))[0, :, 0].astype(float) / 2
+    expected = (np.arange(len(small)) + 0.5) * 125 / len(small) - 0.5
+    assert np.abs(small - expected)[1:-1].max() < 0.3  # a quarter from rounding
+
+
+def test_numbers_make_names_unique() -> None:
+    pictures = [Picture(name, (8, 8), lambda size: None) for name in ("a", "a", "a-000")]  # type: ignore[arg-type]
+    assert [each.name for each in with_unique_names(pictures)] == ["a-001", "a-002", "a-000"]
+
+
+def test_working_size() -> None:
+    for sizes, device, wanted, expected in (
+        ([(600, 800)] * 3, "cpu", None, (210, 280)),
+        ([(600, 800)], "cpu", 140, (112, 140)),
+        ([(600, 800)], "cpu", (28, 56), (28, 56)),
+        ([(600, 800), (800, 600)], "cpu", None, (280, 280)),
+        ([(800, 600)], "cuda", None, (518, 392)),
+        ([(60, 50)], "cpu", None, (56, 42)),  # not more than there is
+    ):
+        assert working_size(sizes, 14, device, wanted) == expected
+    for size, said in (((30, 60), "try 28x56"), (10, "smaller than one patch")):
+        with pytest.raises(ValueError, match=said):
+            working_size([(60, 50)], 14, "cpu", size)
+
+
+def test_files_that_cannot_be_used_are_refused(tmp_path: Path, monkeypatch) -> None:
+    (tmp_path / "IMG.HEIC").touch()
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(ValueError, match="pip install pillow-heif"):
+        find_pictures(tmp_path / "IMG.HEIC")
+
+
+def test_what_is_no_image() -> None:
+    flat, counts, bright = np.zeros((4, 5), np.uint8), np.zeros((4, 5, 3), np.int32), torch.full((3, 4, 5), 2.0)
+    for item, said in ((flat, r"shape \[4, 5\]"), (counts, "uint8"), (bright, r"\[0, 1\]"), (7, "int")):
+        with pytest.raises(ValueError, match=said):
+            find_pictures([item])
+
+
+def test_a_long_video_is_decoded_when_it_is_read(tmp_path: Path, monkeypatch) -> None:
+    pytest.importorskip("av")
+    frames = [np.full((32, 48, 3), 7 * i, np.uint8) for i in range(30)]
+    path = write_video(tmp_path / "walk.mp4", frames)
+    whole = find_pictures(path, max_images=15)
+    monkeypatch.setattr(pictures, "IN_MEMORY", 10)
+    reads = []
+    monkeypatch.setattr(video, "read_video", lambda *inputs: reads.append(inputs) or read_video(*inputs))
+    lazy = find_pictures(path, max_images=15)
+    assert [(p.name, p.size) for p in lazy] == [(p.name, p.size) for p in whole]
+    for i in (0, 1, 5, 14, 3):
+        assert torch.equal(lazy[i].read((32, 48)).images, whole[i].read((32, 48)).images)
+    assert len(reads) == 2  # once in order, once again for the frame before

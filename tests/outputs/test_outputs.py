@@ -1,0 +1,123 @@
+"""Every output is read back by its reader and says the same as the scene in memory."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+
+from vg2gt import io
+from vg2gt.geometry.cameras import project
+from vg2gt.outputs.output_names import OUTPUTS
+from vg2gt.outputs.outputs import write_outputs
+from vg2gt.reconstruction.pipeline import reconstruct_with
+from vg2gt.reconstruction.scene import Scene
+
+
+@pytest.fixture(scope="module")
+def written(scene: Scene, tmp_path_factory) -> Path:
+    return write_outputs(scene, tmp_path_factory.mktemp("out") / "new", list(OUTPUTS))
+
+
+def test_gaussians_and_cameras(written: Path, scene: Scene) -> None:
+    folders = {"color", "depth", "normals"}
+    names = {name for name in OUTPUTS if name.split(".")[0] not in folders}
+    assert {path.name for path in written.iterdir()} == names | folders  # only what was asked
+    back = io.read_gaussian_ply(written / "scene.ply")
+    for field in ("means", "scales", "opacities"):
+        torch.testing.assert_close(getattr(back, field), getattr(scene.gaussians, field), atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(io.read_spz(written / "scene.spz").means, scene.gaussians.means, atol=1e-5, rtol=0)
+    cameras = io.read_cameras_json(written / "cameras.json")
+    assert [camera.name for camera in cameras] == ["008.png", "009.png", "010.png", "011.png"]
+    poses = torch.cat([camera.cameras().world_to_camera for camera in cameras], 1)
+    assert torch.equal(poses, scene.cameras.world_to_camera)
+    assert all((camera.height, camera.width) == scene.cameras.size for camera in cameras)
+
+
+def test_colmap_points_fall_on_their_pixels_and_have_tracks(written: Path, scene: Scene) -> None:
+    model = io.read_colmap(written / "colmap" / "sparse" / "0")
+    assert len(model.points3D) > 5000
+    lengths = np.array([point.track.length() for point in model.points3D.values()])
+    assert lengths.min() >= 1
+    assert (lengths >= 2).mean() > 0.5
+    for index, image in enumerate(io.colmap_images(model)):
+        features = image.get_observation_points2D()
+        points = [model.points3D[feature.point3D_id] for feature in features]
+        seen = np.array([feature.xy for feature in features])
+        pose = io.colmap_pose(image)
+        local = np.array([point.xyz for point in points]) @ pose[:3, :3].T + pose[:3, 3]
+        pixels = local @ io.colmap_intrinsics(image.camera).T
+        assert np.abs(pixels[:, :2] / pixels[:, 2:] + 0.5 - seen).max() < 1e-3
+        picture = np.array(Image.open(written / "colmap" / "images" / image.name))
+        own = np.abs(seen % 1 - 0.5).max(1) < 1e-3  # the view's own points come from the middle of a pixel
+        x, y = (seen - 0.5).round().astype(int).clip(0, [111, 83]).T
+        assert own.mean() > 0.2
+        assert np.array_equal(picture[y, x][own], np.array([point.color for point in points])[own])
+        assert np.abs(local[:, 2] / scene.depth[index, y, x].numpy() - 1).max() < 0.06
+
+
+def cloud(path: Path) -> np.ndarray:
+    points = trimesh.load(path)
+    assert isinstance(points, trimesh.PointCloud)
+    return np.array(points.vertices)
+
+
+def test_nerfstudio(written: Path, scene: Scene) -> None:
+    transforms = io.read_transforms(written / "nerfstudio" / "transforms.json")
+    for frame, camera in zip(transforms.frames, scene.named_cameras(), strict=True):
+        assert (written / "nerfstudio" / frame.file_path).is_file()
+        assert np.abs(frame.world_to_camera - camera.world_to_camera).max() < 1e-6
+        assert np.abs(frame.lens.intrinsics() - camera.intrinsics).max() < 1e-9
+    assert len(cloud(written / "nerfstudio" / transforms.ply_file_path)) > 5000
+
+
+def test_images_larger_than_their_depth_are_exported_at_its_size(recording: Path, ready, tmp_path: Path) -> None:
+    folder = shutil.copytree(recording, tmp_path / "recording")
+    for path in (folder / "images").iterdir():
+        with Image.open(path) as image:
+            image.resize((2 * image.width, 2 * image.height)).save(path)
+    k = np.loadtxt(folder / "K.txt")
+    k[:2] = 2 * k[:2] + [[0, 0, 0.5]]
+    np.savetxt(folder / "K.txt", k)
+    reconstruct_with(ready.model, folder).save(tmp_path / "out", ["nerfstudio"])
+    place = tmp_path / "out" / "nerfstudio"
+    for frame in io.read_transforms(place / "transforms.json").frames:
+        with Image.open(place / frame.file_path) as image:
+            assert image.size == (frame.lens.width, frame.lens.height)
+
+
+def test_points_and_meshes_lie_on_the_surfaces(written: Path, scene: Scene) -> None:
+    points = cloud(written / "points.ply")
+    for suffix in ("ply", "glb"):
+        assert len(trimesh.load_mesh(written / f"mesh.{suffix}").faces) > 1000
+    vertices = torch.from_numpy(np.array(trimesh.load_mesh(written / "mesh.ply").vertices)).float()
+    for candidates, tolerance in ((torch.from_numpy(points).float(), 0.01), (vertices, 0.06)):
+        pixels, depth = project(candidates[None, None], scene.cameras.select(slice(0, 1)))
+        x, y = pixels[0, 0].round().long().unbind(-1)
+        seen = (depth[0, 0] > 0) & (x >= 0) & (x < 112) & (y >= 0) & (y < 84)
+        surface = scene.depth[0, y[seen], x[seen]]
+        error = (depth[0, 0][seen] / surface - 1).abs()[surface > 0]
+        assert error.median() < tolerance
+
+
+def test_reports(written: Path, scene: Scene) -> None:
+    assert Image.open(written / "report.png").size == (5 * 112 + 16, 4 * 84 + 12)
+    figures = json.loads((written / "report.json").read_text())
+    assert (figures["views"], figures["gaussians"]) == (4, len(scene.gaussians))
+    assert set(figures["seconds"]) >= {"write files", "render views"}
+    assert figures["peak_memory_mib"] > 100
+
+
+def test_nothing_is_replaced_unasked(written: Path, scene: Scene, tmp_path: Path) -> None:
+    with pytest.raises(FileExistsError, match=r"scene.ply already exists"):
+        write_outputs(scene, written, ["scene.ply"])
+    with pytest.raises(PermissionError, match=r"scene.ply cannot be written to"):
+        write_outputs(scene, written / "scene.ply", ["scene.ply"])
+    write_outputs(scene, tmp_path, ["color.png"])
+    (tmp_path / "color" / "stale.png").touch()
+    write_outputs(scene, tmp_path, ["color.png"], overwrite=True)
+    assert not (tmp_path / "color" / "stale.png").exists()

@@ -1,0 +1,1 @@
+"""Turns what people have (photographs, videos, recordings, camera files) into pictures with cameras."""

@@ -1,0 +1,128 @@
+"""Sources of a reconstruction's cameras: files next to the images, structure from motion, or the backbone."""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Literal, get_args
+
+from vg2gt.data.base import DataError
+from vg2gt.inputs.given_cameras import LAYOUTS, describe, given_pictures
+from vg2gt.inputs.pictures import (
+    ImagesLike,
+    Picture,
+    check_pictures,
+    find_pictures,
+    without_copies,
+)
+from vg2gt.inputs.sfm import find_cameras, require_pycolmap
+from vg2gt.io.files import by_number
+from vg2gt.model import Reconstructor
+from vg2gt.monitor import Monitor
+
+log = logging.getLogger(__name__)
+
+Poses = Literal["auto", "given", "sfm"]
+
+
+@contextmanager
+def pictures_for(
+    model: Reconstructor,
+    images: ImagesLike,
+    poses: Poses = "auto",
+    *,
+    max_images: int | None = None,
+    sfm_folder: str | Path | None = None,
+    monitor: Monitor | None = None,
+) -> Iterator[list[Picture]]:
+    """Yields the pictures to reconstruct, with cameras if the backbone takes any; they can be read inside the block.
+
+    Args:
+        model: model that will reconstruct them.
+        images: see :func:`vg2gt.inputs.pictures.find_pictures`.
+        poses: ``auto``: a backbone that needs cameras gets those next to the images
+            (:func:`~vg2gt.inputs.given_cameras.given_pictures`), else those of structure from motion
+            (:func:`~vg2gt.inputs.sfm.find_cameras`); other backbones predict their own. ``given`` and ``sfm``
+            allow only that source.
+        max_images: maximum number of pictures, evenly spread.
+        sfm_folder: folder for the result of structure from motion; None: a temporary one.
+        monitor: shows and times the stages.
+
+    Yields:
+        The pictures; of identical files, only the first.
+
+    Raises:
+        FileNotFoundError: if a path does not exist.
+        ImportError: if structure from motion needs pycolmap and it is not installed.
+        ValueError: if there are no pictures, the requested cameras are not available, or the backbone takes none.
+    """
+    backend = model.backend
+    if poses not in get_args(Poses):
+        raise ValueError(f"poses is {poses!r}; choose one of {', '.join(get_args(Poses))}")
+    if poses != "auto" and not backend.needs_hints:
+        raise ValueError(
+            f"backend {backend.name} predicts its own cameras and accepts none: omit --poses, or use a backend that "
+            "accepts them, such as backend=da3_small backend.given_poses=true"
+        )
+    if poses == "sfm" and backend.needs_depth:
+        raise ValueError(f"backend {backend.name} works from the depth and poses of a recording; leave --poses out")
+    if not backend.needs_hints:
+        yield without_copies(find_pictures(images, max_images))
+        return
+    given = None
+    if poses != "sfm":
+        try:
+            given = given_pictures(images, max_images, depth=backend.needs_depth)
+        except DataError as error:
+            if poses == "given" or backend.needs_depth:
+                raise
+            log.warning("cannot use the camera files, running structure from motion instead: %s", error)
+    if given is not None:
+        yield without_copies(given)
+        return
+    if backend.needs_depth:
+        raise ValueError(_no_depth(backend.name, images))
+    if poses == "given":
+        raise ValueError(
+            f"no cameras next to {describe(images)}: expected {LAYOUTS}; --poses sfm finds them from the images"
+        )
+    with tempfile.TemporaryDirectory(prefix="vg2gt-sfm-") as temporary:
+        pictures = without_copies(find_pictures(images, max_images))
+        place = {picture.name: number for number, picture in enumerate(pictures)}
+        if all(picture.path is not None for picture in pictures):  # so that the order of the files does not matter
+            pictures = sorted(pictures, key=lambda picture: by_number(str(picture.path)))
+        found = find_cameras(pictures, Path(sfm_folder or f"{temporary}/sfm"), monitor or Monitor())
+        yield sorted(found, key=lambda picture: place[picture.name])
+
+
+def check_inputs(backend: type, images: Sequence[str], poses: Poses) -> None:
+    """Checks the images, before anything is built: that they can be read, and have or can get what a backend needs.
+
+    Args:
+        backend: class of the backend.
+        images: files and folders.
+        poses: see :func:`pictures_for`.
+
+    Raises:
+        FileNotFoundError: if a path does not exist.
+        ImportError: if a package is not installed; the message says what needs it and how to install it.
+        ValueError: if there are no pictures, or they lack depth.
+    """
+    if getattr(backend, "needs_depth", False) and given_pictures(images, depth=True) is None:
+        raise ValueError(_no_depth(backend.__name__, images))
+    check_pictures(images)
+    needed = poses == "sfm" or getattr(backend, "needs_cameras", False)
+    if needed and importlib.util.find_spec("pycolmap") is None and (poses == "sfm" or given_pictures(images) is None):
+        require_pycolmap()
+
+
+def _no_depth(backend: str, images: ImagesLike) -> str:
+    return (
+        f"backend {backend} needs measured depth, but {describe(images)} has none: it reconstructs RGB-D recordings "
+        "only (depth/ next to images/, with poses.txt and K.txt). For photographs, omit backend= and --ckpt (uses the "
+        "built-in plane sweep), or use backend=da3_small; a checkpoint only works with the backend it was trained on"
+    )

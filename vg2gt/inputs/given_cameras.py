@@ -1,0 +1,286 @@
+"""Pictures with cameras from files next to them: cameras.json, transforms.json, a COLMAP model, a list of poses."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from vg2gt.data.base import DataError, Frames
+from vg2gt.data.sources.colmap_model import COLMAP, model_folder_of
+from vg2gt.data.sources.files import FileSource
+from vg2gt.data.sources.nerfstudio import Nerfstudio, transforms_files
+from vg2gt.data.sources.parsing import IMAGE_SUFFIXES
+from vg2gt.data.sources.phone import app_of
+from vg2gt.data.sources.rgbd import RGBDFolder
+from vg2gt.data.sources.undistortion import size_on_disk, undistortion_of
+from vg2gt.geometry.cameras import resize_intrinsics
+from vg2gt.inputs.pictures import (
+    UNKNOWN_LENS,
+    ImagesLike,
+    Picture,
+    as_items,
+    evenly,
+    existing_path,
+    frame_of,
+    image_files,
+    image_folders,
+    mask_for,
+    shrunk,
+    with_unique_names,
+)
+from vg2gt.io.cameras_json import NamedCamera, Photo, read_cameras_json
+from vg2gt.io.image_files import read_color
+from vg2gt.io.nerfstudio import read_transforms
+from vg2gt.io.record3d import R3D
+
+log = logging.getLogger(__name__)
+
+_CAMERAS, _TRANSFORMS = "cameras.json", "transforms.json"
+LAYOUTS = f"{_CAMERAS}, {_TRANSFORMS}, a COLMAP model in sparse/0, or poses.txt with K.txt"
+
+
+def given_pictures(images: ImagesLike, max_images: int | None = None, depth: bool = False) -> list[Picture] | None:
+    """Lists the pictures whose cameras are in files next to them.
+
+    The search order is ``cameras.json``, ``transforms.json`` (or Blender's ``transforms_train.json``), a COLMAP model,
+    a recording with poses (with or without depth). The search covers the folder of the images, the folder above it,
+    and ``dense/`` of a COLMAP workspace whose images are only there.
+
+    Args:
+        images: a folder, image files, an ``.r3d`` file, or a sequence of these.
+        max_images: maximum number of pictures, evenly spread; None: all.
+        depth: require depth too, and ignore cameras without it.
+
+    Returns:
+        The pictures in order, with unique names; None if any input has no cameras.
+
+    Raises:
+        FileNotFoundError: if a path does not exist.
+        ImportError: if pycolmap is needed and not installed.
+        ValueError: if a file of cameras is damaged, or belongs to other images.
+    """
+    items = as_items(images)
+    if not all(isinstance(item, (str, Path)) for item in items):
+        return None
+    paths = [existing_path(item) for item in items]
+    found: list[Picture] = []
+    for folder, files in _by_folder(paths).items():
+        own = _given(folder, depth)
+        if own is None:
+            return None
+        found += own if files is None else _only(own, files, folder)
+    return with_unique_names(evenly(found, max_images))
+
+
+def recording_pictures(source: FileSource) -> list[Picture]:
+    """Returns the pictures of a source's only scene, with their cameras and depth, each at its own size.
+
+    Raises:
+        ValueError: if the source has several scenes.
+    """
+    if len(source.scenes) > 1:
+        raise ValueError(f"there are {len(source.scenes)} recordings; give one of them: {', '.join(source.scenes)}")
+    scene = source.scenes[0]
+    index = source.scene_index(scene)
+    metric = source.is_metric or (isinstance(source, RGBDFolder) and (index.folder / "depth").is_dir())
+    recorded = metric or not isinstance(source, RGBDFolder) or app_of(index.folder) is not None
+    kind = f"{type(source).__name__ if recorded else 'poses'} {index.folder}"
+
+    def picture(frame: int) -> Picture:
+        """Returns a frame as a picture that is read on demand."""
+
+        def read(size: tuple[int, int]) -> Frames:
+            return source.load_whole(scene, frame)
+
+        row = index.row(frame)
+        color = index.color[row]
+        return Picture(
+            color.stem,
+            index.own_size(row),
+            read,
+            kind,
+            source.has_depth,
+            source.point_depths(scene, frame) if isinstance(source, COLMAP) else None,
+            path=color if color.is_file() and color.suffix.lower() in IMAGE_SUFFIXES else None,
+            pose=index.world_to_camera[row],
+            intrinsics=index.intrinsics[row],
+            is_metric=metric,
+            lens=index.lens(row),
+        )
+
+    tests = set(source.held_out(scene)) if isinstance(source, Nerfstudio) else set()
+    return [picture(frame) for frame in source.frames(scene) if frame not in tests]
+
+
+def _by_folder(paths: Sequence[Path]) -> dict[Path, list[Path] | None]:
+    """Groups inputs by folder: a folder or recording as a whole (None), single images by their folder."""
+    groups: dict[Path, list[Path] | None] = {}
+    for path in paths:
+        if path.is_dir() or app_of(path):
+            groups[path] = None
+        elif (files := groups.setdefault(path.parent, [])) is not None:
+            files.append(path)
+    return groups
+
+
+def _only(pictures: list[Picture], files: list[Path], folder: Path) -> list[Picture]:
+    """Returns the pictures of the named files, in the order of the files."""
+    by_path = {picture.path.resolve(): picture for picture in pictures if picture.path is not None}
+    found = [by_path[file.resolve()] for file in dict.fromkeys(files) if file.resolve() in by_path]
+    _name_left_out([file.name for file in files if file.resolve() not in by_path], f"the folder {folder}")
+    if not found:
+        raise DataError(f"the cameras in {folder} do not match {files[0].name}")
+    return found
+
+
+def _given(folder: Path, depth: bool) -> list[Picture] | None:
+    """Returns the pictures of a folder or recording with the cameras in there, or else one folder up."""
+    inside = image_folders(folder) if folder.is_dir() else []
+    places = [(folder, inside[0].name if inside else ".")]
+    if not inside and (folder / "dense" / "images").is_dir():  # a COLMAP workspace without its distorted originals
+        places.insert(0, (folder / "dense", "images"))
+    if folder.is_dir():
+        places.append((folder.resolve().parent, folder.resolve().name))
+    for place, images in places:
+        pictures, above = None, place == folder.resolve().parent and place != folder
+        if above and not _may_be_of(place, folder.resolve()):
+            continue
+        if not depth and (place / _CAMERAS).is_file():
+            pictures = _from_cameras_json(place / _CAMERAS, place / images)
+        source = None if pictures is not None else _source(place, images, depth)
+        if source is not None and not (above and isinstance(source, RGBDFolder) and len(source.scenes) > 1):
+            pictures = recording_pictures(source)
+        if pictures is not None and above:  # the cameras may be those of other photographs
+            pictures = [each for each in pictures if each.path and _is_in(each.path, folder.resolve())] or None
+        if pictures is not None:
+            _name_missing(pictures, place / images)
+            return pictures
+    return None
+
+
+def _may_be_of(place: Path, folder: Path) -> bool:
+    """Returns whether cameras in ``place`` can be those of a folder in it: not if it has other folders of images."""
+    known = [each.resolve() for each in image_folders(place)]
+    return not known or folder in known
+
+
+def _is_in(path: Path, folder: Path) -> bool:
+    """Returns whether a file, or the link to it, is in a folder or in the one that the folder is a reduced copy of."""
+    parents = {*path.absolute().parents, *path.resolve().parents}
+    original = folder.with_name(re.sub(r"_\d+$", "", folder.name))
+    return folder in parents or original in parents
+
+
+def _source(folder: Path, images: str, depth: bool) -> FileSource | None:
+    """Returns the recording in a folder, with depth if needed; None for plain photographs."""
+    if files := transforms_files(folder):
+        with_depth = depth and any(frame.depth_file_path for frame in read_transforms(files[0]).frames)
+        if with_depth or not depth:
+            return Nerfstudio(str(folder), depth=with_depth)
+    if not depth and model_folder_of(folder) is not None:
+        return COLMAP(str(folder), images=images)
+    has_depth = (folder / "depth").is_dir() or any(folder.glob("frame-*.color.*"))
+    poses = not depth and any((folder / name).exists() for name in ("poses.txt", "pose", "poses"))
+    if app_of(folder) is not None or any(folder.glob(f"*{R3D}")):
+        has_depth = depth  # otherwise colour keeps its full size: a phone's depth is coarse
+    elif not (has_depth or poses):
+        return None
+    return RGBDFolder(str(folder), holdout=None, depth=has_depth)
+
+
+def _name_missing(pictures: list[Picture], folder: Path) -> None:
+    """Warns about images of a folder that have no camera."""
+    known = {picture.path.resolve() for picture in pictures if picture.path is not None}
+    try:
+        files = image_files(folder)
+    except (ValueError, OSError):  # the pictures are elsewhere, such as in an archive
+        return
+    if any(file.resolve() in known for file in files):
+        _name_left_out([file.name for file in files if file.resolve() not in known], pictures[0].source)
+
+
+def _name_left_out(names: Sequence[str], where: str) -> None:
+    if names:
+        shown = ", ".join(names[:10]) + (f" and {len(names) - 10} more" if len(names) > 10 else "")
+        log.warning("%s has no cameras for %d images, which are left out: %s", where, len(names), shown)
+
+
+def _unique(named: Sequence[tuple[str, NamedCamera]]) -> dict[str, NamedCamera]:
+    """Returns the cameras by name, without names of several cameras, such as photos of two folders."""
+    counts = Counter(name for name, _ in {(name, id(camera)) for name, camera in named})
+    return {name: camera for name, camera in named if counts[name] == 1}
+
+
+def _from_cameras_json(path: Path, folder: Path) -> list[Picture] | None:
+    """Returns pictures of a folder with cameras from ``cameras.json``, matched by file name or stem.
+
+    Returns:
+        None if the cameras are of undistorted images and the folder has the original photographs.
+
+    Raises:
+        ValueError: if the file names none of the images.
+    """
+    named = read_cameras_json(path)
+    cameras = _unique([(Path(camera.name).name, camera) for camera in named])
+    cameras |= _unique([(camera.photo.name, camera) for camera in named if camera.photo is not None])
+    by_stem = _unique([(Path(name).stem, camera) for name, camera in cameras.items()])
+    files = image_files(folder)
+    found = [(file, cameras.get(file.name) or by_stem.get(file.stem) or by_stem.get(file.name)) for file in files]
+    known = [(file, camera) for file, camera in found if camera is not None]
+    if not known:
+        raise DataError(f"{path} names none of the {len(files)} images in {folder}, such as {files[0].name}")
+    if any(
+        camera.photo and camera.photo.lens == UNKNOWN_LENS and camera.photo.name == file.name for file, camera in known
+    ):
+        log.warning("%s describes undistorted images and is ignored for the photos in %s", path, folder)
+        return None
+    return [_photo(file, camera, path) for file, camera in known]
+
+
+def _photo(path: Path, camera: NamedCamera, cameras: Path) -> Picture:
+    """Returns a photograph with its camera, that of the whole photograph if the file has it."""
+    photo = camera.photo
+    if photo is None or photo.name != path.name:
+        photo = Photo(path.name, camera.width, camera.height, camera.intrinsics)
+    undistortion = undistortion_of(photo.lens) if photo.lens else None
+    expected = undistortion.lens_size if undistortion else (photo.height, photo.width)
+    size, upright = size_on_disk(path, path.parent.name, expected, str(cameras), as_stored=False)
+    intrinsics = torch.from_numpy(photo.intrinsics)
+    pose = torch.from_numpy(camera.world_to_camera)
+
+    def read(wanted: tuple[int, int]) -> Frames:
+        """Reads the undistorted photograph with its mask and camera, reduced to about the wanted size."""
+        pixels = read_color(path, path.parent.name, upright=upright)
+        mask = mask_for(path, upright)
+        if undistortion is None:
+            frames = frame_of(shrunk(pixels, wanted), mask)
+        else:
+            frames = frame_of(undistortion.color(pixels), None if mask is None else undistortion.depth(mask))
+        height, width = frames.images.shape[-2:]
+        matrix = resize_intrinsics(intrinsics, width / photo.width, height / photo.height)
+        return replace(frames, world_to_camera=pose.float()[None], intrinsics=matrix.float()[None])
+
+    return Picture(
+        path.stem,
+        (photo.height, photo.width) if undistortion else size,
+        read,
+        f"{_CAMERAS} {cameras.parent}",
+        path=path,
+        pose=camera.world_to_camera,
+        intrinsics=photo.intrinsics,
+        is_metric=camera.metres_per_unit == 1,
+        lens=photo.lens,
+    )
+
+
+def describe(images: Any) -> str:
+    """Describes the input in a few words, for messages."""
+    items = [str(item) if isinstance(item, (str, Path)) else type(item).__name__ for item in as_items(images)]
+    return ", ".join(items[:3]) + (f" and {len(items) - 3} more" if len(items) > 3 else "")

@@ -1,0 +1,204 @@
+"""Loads pictures of any size at one working size, with what is known about their cameras."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional as F
+
+from vg2gt.data.base import Frames
+from vg2gt.data.transforms import resize_to_cover, to_bytes
+from vg2gt.geometry.cameras import crop_intrinsics, resize_intrinsics
+from vg2gt.inputs.pictures import Picture
+from vg2gt.io.cameras_json import NamedCamera, Photo
+from vg2gt.monitor import Monitor
+from vg2gt.types import Cameras, Geometry, Hints
+
+log = logging.getLogger(__name__)
+
+LONGER_SIDE = {"cuda": 518, "cpu": 280}  # pixels, by device; foundation models are trained at about 518
+_THUMBNAIL = 24  # pixels per side
+_LEAST_KEPT = 0.75  # share of a picture's area; cropping more is warned about
+_FEWEST_POINTS = 20  # minimum observations of sparse points for a depth range
+_OUTLIERS, _NEARER, _FARTHER = 1, 0.8, 1.4  # percent cut at either end, widening factors
+
+
+@dataclass(frozen=True)
+class Views:
+    """The input of a reconstruction.
+
+    Attributes:
+        images: ``[V, 3, H, W]`` float32 in [0, 1], on the CPU.
+        names: one per view, unique.
+        hints: known inputs, on the CPU: at least the order of the pictures.
+        mask: ``[V, H, W]`` float32 in [0, 1], pixel weights (alpha, mask images); None: all pixels count.
+    """
+
+    images: Tensor
+    names: tuple[str, ...]
+    hints: Hints
+    mask: Tensor | None = None
+
+
+def working_size(
+    sizes: Sequence[tuple[int, int]], patch: int, device: str, size: int | tuple[int, int] | None = None
+) -> tuple[int, int]:
+    """Returns the common ``(height, width)`` of all images, in multiples of the patch size.
+
+    The aspect ratio is the geometric mean of the pictures' ratios, which crops mixed shapes the least.
+
+    Args:
+        sizes: ``(height, width)`` of the pictures.
+        patch: patch size of the backend.
+        device: type of the compute device; decides the default.
+        size: longer side in pixels (rounded down to patches), or exact (height, width); None: 518 on a GPU, 280 on a
+            CPU, but at most the median longer side of the pictures.
+
+    Raises:
+        ValueError: if the size is smaller than a patch, or given exactly and not a multiple of the patch.
+    """
+    if isinstance(size, tuple):
+        if min(size) < patch or any(side % patch for side in size):
+            near = "x".join(str(max(round(side / patch), 1) * patch) for side in size)
+            raise ValueError(f"size {size[0]}x{size[1]} is not a multiple of the patch size {patch}; try {near}")
+        return size
+    if size is not None and size < patch:
+        raise ValueError(f"size {size} is smaller than one patch of {patch} pixels")
+    shape = math.exp(sum(math.log(height / width) for height, width in sizes) / len(sizes))
+    longest = sorted(max(pair) for pair in sizes)[len(sizes) // 2]
+    longer = max(size or min(LONGER_SIDE.get(device, LONGER_SIDE["cuda"]), longest), patch) // patch
+    shorter = max(1, round(longer * min(shape, 1 / shape)))
+    return (longer * patch, shorter * patch) if shape > 1 else (shorter * patch, longer * patch)
+
+
+def load_views(pictures: Sequence[Picture], size: tuple[int, int], monitor: Monitor) -> Views:
+    """Decodes pictures one by one; each is resized to cover the working size and centre-cropped.
+
+    Raises:
+        ValueError: if a picture cannot be read, naming it.
+    """
+    frames: list[Frames] = []
+    with monitor.stage("load images", len(pictures)) as advance:
+        for picture in pictures:
+            frames.append(resize_to_cover(picture.read(size), size))
+            advance()
+    ratios = [(p.size[0] / p.size[1]) / (size[0] / size[1]) for p in pictures]
+    much = [p.name for p, ratio in zip(pictures, ratios, strict=True) if min(ratio, 1 / ratio) < _LEAST_KEPT]
+    if much:
+        log.warning(
+            "%d of %d images have a different aspect ratio than %dx%d and lose more than a quarter to cropping (first: "
+            "%s); reconstruct images of one shape together, or choose another size",
+            len(much), len(pictures), size[0], size[1], much[0],
+        )  # fmt: skip
+    joined = Frames.concatenate(frames)
+    mask = None if joined.mask is None else joined.mask[None]
+    source, hints = source_of(pictures), Hints(frame_ids=torch.arange(len(pictures))[None], mask=mask)
+    if source:
+        cameras = Cameras(given_poses(pictures, map_shift(pictures))[None], joined.intrinsics[None], size)
+        depth = joined.depth[None] if all(picture.has_depth for picture in pictures) else None
+        hints = Hints(depth, cameras, (source,), hints.frame_ids, depth_range(pictures), mask)
+    return Views(joined.images, tuple(picture.name for picture in pictures), hints, joined.mask)
+
+
+def photo_of(camera: NamedCamera, picture: Picture) -> Photo:
+    """Returns the camera of a view's whole photograph from the view's camera (inverse of ``resize_to_cover``)."""
+    name = camera.name if picture.path is None else picture.path.name
+    height, width = picture.size
+    scale = max(camera.height / height, camera.width / width)
+    covering = [
+        max(least, math.floor(side * scale + 0.5)) for least, side in ((camera.height, height), (camera.width, width))
+    ]
+    room = ((covering[0] - camera.height) // 2, (covering[1] - camera.width) // 2)
+    matrix = crop_intrinsics(torch.from_numpy(camera.intrinsics), -room[1], -room[0])
+    matrix = resize_intrinsics(matrix, width / covering[1], height / covering[0])
+    return Photo(name, width, height, matrix.numpy(), picture.lens)
+
+
+def source_of(pictures: Sequence[Picture]) -> str:
+    """Returns the source of all pictures' cameras; empty if any has none.
+
+    Raises:
+        ValueError: if they come from several recordings, whose world frames are unrelated.
+    """
+    sources = {picture.source for picture in pictures}
+    if "" in sources:
+        return ""
+    if len(sources) > 1:
+        raise ValueError(f"cameras of several recordings cannot be mixed: {', '.join(sorted(sources))}; give one")
+    return sources.pop()
+
+
+def map_shift(pictures: Sequence[Picture]) -> NDArray[np.float64]:
+    """Returns the translation ``[4, 4]`` to the first camera if map coordinates are too large for float32, else I."""
+    poses = _poses(pictures)
+    shift = np.eye(4)
+    shift[:3, 3] = -poses[0, :3, :3].T @ poses[0, :3, 3]
+    far = np.abs(poses[:, :3, 3]).max() > 1e3 * np.abs((poses @ shift)[:, :3, 3]).max()
+    return shift if far else np.eye(4)
+
+
+def given_poses(pictures: Sequence[Picture], shift: NDArray[np.float64]) -> Tensor:
+    """Returns given poses ``[V, 4, 4]`` in the world that ``shift [4, 4]`` (:func:`map_shift`) maps to their own."""
+    return torch.from_numpy(_poses(pictures) @ shift).float()
+
+
+def _poses(pictures: Sequence[Picture]) -> NDArray[np.float64]:
+    return np.stack([np.eye(4) if picture.pose is None else picture.pose for picture in pictures])
+
+
+def depth_range(pictures: Sequence[Picture]) -> Tensor | None:
+    """Returns near and far ``[1, 2]`` of the pictures' sparse points; None if there are too few.
+
+    The range leaves out 1 % of the observed points at either end and is then widened: points lie on texture, so floors
+    in front of the camera and bare walls behind have none. The plane sweep also searches beyond this range.
+    """
+    known = [picture.point_depths for picture in pictures if picture.point_depths is not None]
+    depths = np.concatenate(known) if known else np.zeros(0)
+    if len(depths) < _FEWEST_POINTS:
+        return None
+    near, far = np.percentile(depths, (_OUTLIERS, 100 - _OUTLIERS))
+    return torch.tensor([[near * _NEARER, far * _FARTHER]], dtype=torch.float32)
+
+
+def working_order(images: Tensor) -> list[int]:
+    """Returns the indices of views ``[V, 3, H, W]`` in processing order.
+
+    The first view defines the scene's frame: it is the one that looks most like the others, by the correlation of
+    thumbnails. The others are sorted by a hash of their contents.
+    """
+    contents = [hashlib.sha256(to_bytes(image).numpy().tobytes()).hexdigest() for image in images]
+    order = sorted(range(len(contents)), key=lambda view: contents[view])
+    unit = thumbnails(images)[order]
+    reference = int((unit @ unit.mean(0)).argmax())
+    return [order[reference], *(view for place, view in enumerate(order) if place != reference)]
+
+
+def thumbnails(images: Tensor) -> Tensor:
+    """Returns small grey images ``[V, 576]`` of zero mean and unit length, float64: their products are correlations."""
+    gray = (image[None].mean(1, keepdim=True) for image in images)  # one by one, to bound memory
+    small = torch.cat([F.interpolate(image, (_THUMBNAIL, _THUMBNAIL), mode="area").flatten(1) for image in gray])
+    return F.normalize(small.double() - small.double().mean(1, keepdim=True), dim=1)
+
+
+def in_order(views: Views, order: Sequence[int]) -> tuple[Tensor, Hints]:
+    """Returns images ``[V, 3, H, W]`` and hints of the views in another order."""
+    hints = views.hints
+    cameras = None if hints.cameras is None else hints.cameras.select(torch.tensor(order))
+    parts = {name: getattr(hints, name) for name in ("depth", "frame_ids", "mask")}
+    chosen = {name: None if value is None else value[:, list(order)] for name, value in parts.items()}
+    return views.images[list(order)], replace(hints, cameras=cameras, **chosen)
+
+
+def as_given(geometry: Geometry, order: Sequence[int]) -> Geometry:
+    """Reorders geometry from processing order to the order in which the views were given."""
+    back = torch.tensor(order).argsort()
+    cameras: Cameras = geometry.cameras.select(back.to(geometry.depth.device))
+    return replace(geometry, depth=geometry.depth[:, back], depth_conf=geometry.depth_conf[:, back], cameras=cameras)

@@ -1,0 +1,404 @@
+"""Camera estimation by structure from motion: COLMAP's incremental mapper from pycolmap (``vg2gt[colmap]``).
+
+All pairs of up to 60 photographs are matched. With more, each is matched with some earlier ones in the given order, at
+doubling distances (neighbours on a walk have little baseline), and with those that look alike by VLAD vectors (Jegou et
+al. 2010) of SIFT features. Their vocabulary is built from the photographs, so that none has to be downloaded.
+
+The result is kept in a folder that every command reads as a COLMAP recording: undistorted ``images/``, ``masks/`` if
+there are masks, a model of PINHOLE cameras in ``sparse/``, and ``sfm.json``, which identifies the input pictures.
+COLMAP's SIMPLE_RADIAL lens model (one radial coefficient) is fitted and the images are undistorted with it, because a
+pinhole model fitted to a distorted lens gets a wrong focal length.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import json
+import logging
+import shutil
+import tempfile
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+from scipy.cluster.vq import kmeans2, vq
+
+from vg2gt.data.sources.colmap_model import COLMAP, model_folder_of
+from vg2gt.data.transforms import reduce_to_fit, to_bytes
+from vg2gt.inputs.given_cameras import LAYOUTS, recording_pictures
+from vg2gt.inputs.pictures import SFM_SOURCE, UNKNOWN_LENS, Picture, digest, mask_file
+from vg2gt.io.colmap import EXTRA, quiet_colmap
+from vg2gt.io.errors import FormatError
+from vg2gt.io.files import read_json, whole_folder, write_json
+from vg2gt.monitor import Monitor
+
+if TYPE_CHECKING:
+    from pycolmap import Reconstruction  # pyright: ignore[reportMissingImports]
+
+log = logging.getLogger(__name__)
+
+FORMAT = 1
+"""Version of the folder's format; increment it when the format changes."""
+IMAGE_SIDE = 1600  # maximum longer side of the kept images, in pixels
+LARGE_SIDE = 1200  # features of images from this longer side on are searched without doubling the images first
+FEATURE_SIDE, FEATURES = 1280, 4096  # longer side of doubled images before doubling, maximum number of features
+MANY_SIDE, MANY_FEATURES = 1024, 2048  # the same for more than ALL_PAIRS photographs
+ALL_PAIRS = 60  # number of photographs up to which all pairs are matched
+DISTANCES = (1, 2, 4, 8, 16)  # to the paired photographs in the given order
+ALIKE = 10  # similar photographs per photograph
+APART = 3  # they are more than this far apart in the order: frames of a video would all be neighbours
+WORDS, ROUNDS, SAMPLE = 64, 10, 20_000  # clusters, iterations and sampled features of k-means
+SEED = 0
+_MODEL = "SIMPLE_RADIAL"
+_QUALITY = 95  # JPEG quality of the kept images
+FEWEST_POINTS = 20  # minimum number of points of a sound model: a camera that only rotates yields none
+_AT_ONCE = 4  # images per batch of feature extraction, to bound memory
+_PAIRS_AT_ONCE = 256  # pairs per call of the matcher, which indexes the features of every image in each call
+_STATE = "sfm.json"
+_MASKS = "masks"
+
+_OTHERWISE = f"or put camera files next to them ({LAYOUTS}), or use a backend that needs no cameras, such as da3_small"
+ADVICE = (
+    "take more photographs, 20 or more, walking around the scene rather than turning on the spot, each overlapping "
+    f"the previous one by two thirds; {_OTHERWISE}"
+)
+
+
+def require_pycolmap() -> None:
+    """Checks early that pycolmap is installed.
+
+    Raises:
+        ImportError: if it is not; the message names the remedies.
+    """
+    if importlib.util.find_spec("pycolmap") is None:
+        raise ImportError(f"finding the cameras of photographs needs pycolmap: {EXTRA}; {_OTHERWISE}")
+
+
+def find_cameras(pictures: Sequence[Picture], folder: Path, monitor: Monitor) -> list[Picture]:
+    """Returns the pictures for which structure from motion finds a camera: undistorted, with sparse point depths.
+
+    Pictures with the same size and EXIF focal length share one lens. The world frame is COLMAP's, scaled so that the
+    median depth of the points over all views is 1. Random seeds are fixed.
+
+    Args:
+        pictures: in order; their cameras, if any, are ignored.
+        folder: folder of the result; if it already holds the result for the same pictures, nothing is computed.
+        monitor: shows and times the stages.
+
+    Returns:
+        The placed pictures in the same order and with the same names; the others are named in a warning.
+
+    Raises:
+        ImportError: if pycolmap is needed and not installed.
+        FileExistsError: if the folder contains other files.
+        ValueError: if no model of the scene is found; the message says what to try.
+    """
+    key = _key(pictures)
+    state = _read_state(folder, key)
+    if state is None:
+        require_pycolmap()
+        if folder.exists() and any(folder.iterdir()) and not (folder / _STATE).is_file():
+            raise FileExistsError(f"{folder} already exists and contains other files; move it or choose another --out")
+        if len(pictures) < 2:
+            raise ValueError(f"a single image is not enough to estimate depth or cameras: {ADVICE}")
+        state = _solve(pictures, folder, key, monitor)
+    if state["left_out"]:
+        log.warning(
+            "%d of %d images overlap too little with the others; they have no cameras and are left out: %s",
+            len(state["left_out"]), len(pictures), ", ".join(state["left_out"]),
+        )  # fmt: skip
+    for part in state.get("other_parts", []):
+        log.warning(
+            "%d of them form a separate part with no overlap with the %d images used; take photographs in between, or "
+            "reconstruct that part separately: %s",
+            len(part), len(state["images"]), ", ".join(part),
+        )  # fmt: skip
+    names = state["images"]
+    source = f"{SFM_SOURCE}, {len(names)} of {len(pictures)} images"
+    paths = {picture.name: picture.path for picture in pictures}
+    found = [(names[f"{p.name}.jpg"], p) for p in recording_pictures(COLMAP(str(folder)))]
+    return [replace(p, name=name, source=source, path=paths[name], lens=UNKNOWN_LENS) for name, p in found]
+
+
+def _key(pictures: Sequence[Picture]) -> str:
+    """Returns a hash of the pictures' contents, masks, names and order, and of the processing settings."""
+    features = feature_settings([max(picture.size) for picture in pictures])
+    settings = [FORMAT, IMAGE_SIDE, *features, SEED, _MODEL, _QUALITY]
+    contents = []
+    for picture in pictures:
+        mask = None if picture.path is None else mask_file(picture.path)
+        hashed = [] if mask is None else [hashlib.sha256(mask.read_bytes()).hexdigest()]
+        contents.append([picture.name, picture.size, digest(picture), *hashed])
+    return hashlib.sha256(json.dumps([settings, contents]).encode()).hexdigest()
+
+
+def _read_state(folder: Path, key: str) -> dict[str, Any] | None:
+    """Reads the state of a result folder; None if it is missing, damaged, incomplete, or of other pictures."""
+    try:
+        state = read_json(folder / _STATE)
+        same = state["key"] == key and all((folder / "images" / name).is_file() for name in state["images"])
+    except (FormatError, OSError, KeyError, TypeError):
+        return None
+    return state if same and model_folder_of(folder) is not None else None
+
+
+def _solve(pictures: Sequence[Picture], folder: Path, key: str, monitor: Monitor) -> dict[str, Any]:
+    with tempfile.TemporaryDirectory(prefix="vg2gt-sfm-") as temporary, quiet_colmap():
+        work = Path(temporary)
+        with monitor.stage("read photographs", len(pictures)) as advance:
+            lenses = _stage(pictures, work, advance)
+        names = sorted(name for members in lenses.values() for name in members)
+        _find_features(work, lenses, names, monitor)
+        _match(work, names, monitor)
+        models = _map(work, len(names), monitor)
+        if not models:
+            raise ValueError(
+                f"cannot find the cameras of these {len(pictures)} images: too few overlap, taken from nearby but "
+                f"different positions; {ADVICE}"
+            )
+        placed, *others = _parts(models)
+        _write(models[0], work)
+        titles = {name: picture.name for name, picture in zip(names, pictures, strict=True)}
+        state = {
+            "key": key,
+            "images": {name: title for name, title in titles.items() if name in placed},
+            "left_out": [title for name, title in titles.items() if name not in placed],
+            "other_parts": [[titles[name] for name in sorted(part)] for part in others if part],
+        }
+        with whole_folder(folder) as staged:
+            for part in ("images", "sparse"):
+                shutil.move(work / "undistorted" / part, staged / part)
+            if (work / _MASKS).exists():
+                shutil.move(work / "undistorted-masks" / "images", staged / "masks")
+            write_json(staged / _STATE, state)
+    return state
+
+
+def _stage(pictures: Sequence[Picture], work: Path, advance: Any) -> dict[tuple[int, int, float], list[str]]:
+    """Writes the pictures as numbered upright JPEGs; returns their names by (height, width, focal length or 0).
+
+    If any picture has a mask, masks are written for all: to ``masks/`` with COLMAP's names and to ``mask-images/``.
+    """
+    lenses: dict[tuple[int, int, float], list[str]] = {}
+    masks: dict[str, NDArray[np.uint8]] = {}
+    (work / "images").mkdir()
+    for number, picture in enumerate(pictures):
+        shrink = min(1.0, IMAGE_SIDE / max(picture.size))
+        target = (round(picture.size[0] * shrink), round(picture.size[1] * shrink))
+        frames = reduce_to_fit(picture.read(target), (IMAGE_SIDE, IMAGE_SIDE))
+        pixels = to_bytes(frames.images[0]).permute(1, 2, 0).numpy()
+        name = f"{number:06d}.jpg"
+        Image.fromarray(pixels).save(work / "images" / name, quality=_QUALITY, subsampling=0)
+        height, width = pixels.shape[:2]
+        focal = 0.0 if picture.focal is None else round(picture.focal * width / picture.size[1], 1)
+        lenses.setdefault((height, width, focal), []).append(name)
+        if frames.mask is not None:
+            masks[name] = to_bytes(frames.mask[0]).numpy()
+        advance()
+    for (height, width, _), names in lenses.items():
+        for name in names if masks else []:
+            mask = Image.fromarray(masks.get(name, np.full((height, width), 255, np.uint8)))
+            for file in (work / _MASKS / f"{name}.png", work / "mask-images" / name):
+                file.parent.mkdir(exist_ok=True)
+                mask.save(file, quality=_QUALITY)
+    return lenses
+
+
+def feature_settings(sides: Sequence[int]) -> tuple[int, int, int]:
+    """Chooses the longer side of the images for feature extraction, the maximum number of features, and SIFT's octave.
+
+    Args:
+        sides: longer side of every image in pixels.
+
+    Returns:
+        Side, number, and first octave: -1 doubles images first, which small ones need to have enough features; 0 takes
+        large ones as they are, in a third of the time.
+    """
+    side, features = (FEATURE_SIDE, FEATURES) if len(sides) <= ALL_PAIRS else (MANY_SIDE, MANY_FEATURES)
+    return (IMAGE_SIDE, features, 0) if min(sides) >= LARGE_SIDE else (side, features, -1)
+
+
+def _find_features(
+    work: Path, lenses: dict[tuple[int, int, float], list[str]], names: Sequence[str], monitor: Monitor
+) -> None:
+    import pycolmap  # pyright: ignore[reportMissingImports]
+
+    database, images = work / "database.db", work / "images"
+    pycolmap.Database.open(database).close()
+    for (height, width, focal), members in lenses.items():
+        reader = pycolmap.ImageReaderOptions()
+        reader.camera_model = _MODEL
+        if focal:
+            reader.camera_params = f"{focal},{width / 2},{height / 2},0"
+        pycolmap.import_images(
+            database, images, camera_mode=pycolmap.CameraMode.SINGLE, image_names=members, options=reader
+        )
+    options = pycolmap.FeatureExtractionOptions()
+    options.use_gpu = False
+    options.num_threads = _threads()
+    sides = [max(height, width) for (height, width, _), members in lenses.items() for _ in members]
+    settings = feature_settings(sides)
+    options.max_image_size, options.sift.max_num_features, options.sift.first_octave = settings
+    masked = pycolmap.ImageReaderOptions()
+    if (work / _MASKS).exists():
+        masked.mask_path = work / _MASKS
+    with monitor.stage("find features", len(names)) as advance:
+        for start in range(0, len(names), _AT_ONCE):
+            some = list(names[start : start + _AT_ONCE])
+            pycolmap.extract_features(
+                database,
+                images,
+                image_names=some,
+                reader_options=masked,
+                extraction_options=options,
+                device=pycolmap.Device.cpu,
+            )
+            for _ in some:
+                advance()
+
+
+def _match(work: Path, names: Sequence[str], monitor: Monitor) -> None:
+    """Matches all pairs of images, or, if there are many images, likely pairs only."""
+    import pycolmap  # pyright: ignore[reportMissingImports]
+
+    database = work / "database.db"
+    chosen = [(before, later) for later in range(len(names)) for before in range(later)]
+    if len(names) > ALL_PAIRS:
+        chosen = likely_pairs(_descriptors(database, names))
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.use_gpu = False
+    matching.num_threads = _threads()
+    checking = pycolmap.TwoViewGeometryOptions()
+    checking.ransac.random_seed = SEED
+    pairs = pycolmap.ImportedPairingOptions()
+    pairs.match_list_path = work / "pairs.txt"
+    parts = [chosen[start : start + _PAIRS_AT_ONCE] for start in range(0, len(chosen), _PAIRS_AT_ONCE)]
+    with monitor.stage("match features", len(parts)) as advance:
+        for part in parts:
+            (work / "pairs.txt").write_text("".join(f"{names[before]} {names[later]}\n" for before, later in part))
+            pycolmap.match_image_pairs(
+                database,
+                matching_options=matching,
+                pairing_options=pairs,
+                verification_options=checking,
+                device=pycolmap.Device.cpu,
+            )
+            advance()
+
+
+def _map(work: Path, count: int, monitor: Monitor) -> list[Reconstruction]:
+    """Returns the models with enough points that COLMAP's incremental mapper finds, the one with most images first.
+
+    The global mapper (``pycolmap.global_mapping``) is not used: on the fox scene it places all 24 photographs with a
+    small reprojection error, but a quarter of the path away from their positions, even with calibrated focal lengths.
+    """
+    import pycolmap  # pyright: ignore[reportMissingImports]
+
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = 1  # fixed order of sums: reproducible cameras
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
+    pycolmap.set_random_seed(SEED)
+    (work / "models").mkdir()
+    expected = iter(range(count))
+    with monitor.stage("place cameras", count) as advance:
+        models = pycolmap.incremental_mapping(
+            work / "database.db",
+            work / "images",
+            work / "models",
+            options=options,
+            next_image_callback=lambda: advance() if next(expected, None) is not None else None,
+        )
+    sound = [model for model in models.values() if model.num_points3D() >= FEWEST_POINTS]
+    return sorted(sound, key=lambda model: (model.num_reg_images(), model.num_points3D()), reverse=True)
+
+
+def _parts(models: Sequence[Reconstruction]) -> list[set[str]]:
+    """Returns the names of the images that have a camera in each model and in none before it."""
+    parts: list[set[str]] = []
+    for model in models:
+        placed = {image.name for image in model.images.values() if image.has_pose}
+        parts.append(placed.difference(*parts))
+    return parts
+
+
+def _descriptors(database: Path, names: Sequence[str]) -> list[NDArray[np.uint8]]:
+    import pycolmap  # pyright: ignore[reportMissingImports]
+
+    with closing(pycolmap.Database.open(database)) as opened:
+        numbers = {image.name: image.image_id for image in opened.read_all_images()}
+        return [np.asarray(opened.read_descriptors(numbers[name]).data) for name in names]
+
+
+def _write(model: Reconstruction, work: Path) -> None:
+    """Scales the points' median depth to 1 and writes undistorted images and their model to ``work/undistorted``."""
+    import pycolmap  # pyright: ignore[reportMissingImports]
+
+    depths = []
+    for image in model.images.values():
+        if image.has_pose:
+            pose = image.cam_from_world().matrix()
+            ids = [point.point3D_id for point in image.points2D if point.has_point3D()]
+            depths += [float(pose[2, :3] @ model.points3D[number].xyz + pose[2, 3]) for number in ids]
+    model.transform(pycolmap.Sim3d(1 / float(np.median(depths)), pycolmap.Rotation3d(), np.zeros(3)))
+    (work / "model").mkdir()
+    model.write(work / "model")
+    for source, target in (("images", "undistorted"), ("mask-images", "undistorted-masks")):
+        if (work / source).exists():
+            pycolmap.undistort_images(
+                work / target, work / "model", work / source, jpeg_quality=_QUALITY, num_threads=_threads()
+            )
+
+
+def likely_pairs(descriptors: Sequence[NDArray[np.uint8]]) -> list[tuple[int, int]]:
+    """Returns pairs (earlier, later) of photographs that probably show the same things, sorted by the later one.
+
+    Args:
+        descriptors: ``[n, 128]`` SIFT descriptors of each photograph, in order; ``n`` may be 0.
+    """
+    vectors = _vlad(descriptors)
+    likeness = vectors @ vectors.T
+    count = len(descriptors)
+    pairs = {(i - distance, i) for distance in DISTANCES for i in range(distance, count)}
+    for i in range(count):
+        taken = [i]
+        for j in np.argsort(-likeness[i], kind="stable").tolist():
+            if len(taken) > ALIKE:
+                break
+            if min(abs(j - k) for k in taken) > APART:
+                taken.append(j)
+                pairs.add((min(i, j), max(i, j)))
+    return sorted(pairs, key=lambda pair: pair[::-1])
+
+
+def _vlad(descriptors: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
+    """Returns a unit vector per photograph, ``[N, words * 128]``: summed residuals of features to their words."""
+    everything = np.concatenate([np.zeros((0, 128), np.uint8), *descriptors])
+    if not len(everything):
+        return np.zeros((len(descriptors), 1), np.float32)
+    chosen = np.random.default_rng(SEED).permutation(len(everything))[:SAMPLE]
+    sample = everything[chosen].astype(np.float32)
+    words, _ = kmeans2(sample, sample[:WORDS], ROUNDS, minit="matrix")
+    found = np.zeros((len(descriptors), *words.shape), np.float32)
+    for row, own in enumerate(descriptors):
+        features = own.astype(np.float32)
+        nearest, _ = vq(features, words)
+        np.add.at(found[row], nearest, features - words[nearest])
+    # Normalise the part of each word first, so that none dominates.
+    return _unit(_unit(found).reshape(len(found), -1))
+
+
+def _unit(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
+    length = np.sqrt((vectors**2).sum(-1, keepdims=True, dtype=np.float32))
+    return vectors / np.maximum(length, np.float32(1e-9))
+
+
+def _threads() -> int:
+    """Returns the number of threads, at most one per image of a feature extraction batch; matching uses the same."""
+    return min(_AT_ONCE, torch.get_num_threads())
