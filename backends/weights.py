@@ -35,6 +35,7 @@ class Weights:
         seed: seed of random weights.
         prefix: prefix of the keys in the file, before the network's own names.
         ignorable: prefixes of keys that may be in the file but not in the network.
+        entry: key of the tensors in a file of ``torch.save`` that also holds an optimiser or the like.
     """
 
     name: str
@@ -46,6 +47,7 @@ class Weights:
     seed: int
     prefix: str = ""
     ignorable: tuple[str, ...] = ()
+    entry: str | None = None
 
     def build(self, make: Callable[[], Network]) -> Network:
         """Builds a network with these weights.
@@ -64,7 +66,7 @@ class Weights:
         file = self.find()
         with torch.device("meta"):
             network = make()
-        load_strictly(network, read_tensors(file), self.prefix, self.ignorable, str(file))
+        load_strictly(network, read_tensors(file, self.entry), self.prefix, self.ignorable, str(file))
         print(f"{self.name}: weights from {self.path or self.repo}, licence: {self.licence}")
         return network
 

@@ -1,7 +1,8 @@
 """Depth of the learned plane sweep: ``python benchmarks/plane_sweep.py``.
 
 Only cameras are given; the network finds the depth range. Scenes are procedural ones on which nothing was trained, with
-``--shared FOLDER`` also real recordings, and with ``--infinigen FOLDER`` rooms of Infinigen. Depth is compared after
+``--shared FOLDER`` also real recordings, and with ``--infinigen FOLDER`` rooms of Infinigen. ``--itermvs FOLDER`` runs
+IterMVS (``examples/backends``) on the same views. Depth is compared after
 alignment by one median scale per set of views, except ``raw``. Prints a table and writes a dated JSON file.
 """
 
@@ -9,13 +10,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
 
 import torch
 from common import machine, parser, write_results
 from hydra.utils import instantiate
 
+from backends.base import Backend
 from backends.sweep import SweepBackend
+from examples.backends.itermvs import IterMVSBackend
 from vg2gt import __version__
 from vg2gt.config import compose
 from vg2gt.metrics.kinds import KINDS, pixel_kinds
@@ -45,7 +49,7 @@ def batches(overrides: str) -> Iterator[Batch]:
 
 
 @torch.no_grad()
-def measure(backend: SweepBackend, batch: Batch) -> dict[str, float]:
+def measure(backend: Backend, batch: Batch) -> dict[str, float]:
     """Computes depth errors of a batch of one scene over all pixels with known truth (not 0).
 
     Returns:
@@ -82,19 +86,24 @@ def main() -> None:
     arguments.add_argument("--infinigen", type=Path, help="folder with rooms made by recipes/infinigen")
     arguments.add_argument("--weights", help="safetensors file instead of the shipped weights")
     arguments.add_argument("--scenes", type=int, default=16, help="number of procedural scenes of a kind")
+    arguments.add_argument("--itermvs", type=Path, help="checkout of FangjinhuaWang/IterMVS: measures it as well")
     options = arguments.parse_args()
     torch.set_num_threads(1)
     backend = SweepBackend(path=options.weights)
+    backends: dict[str, Backend] = {"": backend}
+    if options.itermvs:
+        weights = options.itermvs / "checkpoints/blendedmvs/model_000015.ckpt"
+        backends[", IterMVS"] = IterMVSBackend(path=str(weights))
     sets: dict[str, dict[str, float]] = {}
-    for name, overrides in SETS.items():
+    for (name, overrides), (suffix, network) in product(SETS.items(), backends.items()):
         if any(f"{{{place}}}" in overrides and not getattr(options, place) for place in ("shared", "infinigen")):
             continue
-        rows = [measure(backend, batch) for batch in batches(overrides.format(**vars(options)))]
+        rows = [measure(network, batch) for batch in batches(overrides.format(**vars(options)))]
         figures = {key: sum(row[key] for row in rows) / len(rows) for key in rows[0]}
         for kind in KINDS:  # the parts of abs_rel of all windows, to means over the pixels of that kind
             figures[f"abs_rel {kind}"] = figures.pop(f"error {kind}") / max(figures[f"share {kind}"], 1e-9)
-        sets[name] = figures
-        print(f"{name:18}", " ".join(f"{key} {value:.4f}" for key, value in figures.items() if " " not in key))
+        sets[name + suffix] = figures
+        print(f"{name + suffix:18}", " ".join(f"{key} {value:.4f}" for key, value in figures.items() if " " not in key))
         kinds = (f"{kind} {figures[f'share {kind}']:.0%} {figures[f'abs_rel {kind}']:.3f}" for kind in KINDS)
         print(" " * 18, ", ".join(kinds), flush=True)
     content = {"machine": machine(), "version": __version__, "weights": backend.identity()["weights"], "sets": sets}

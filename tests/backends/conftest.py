@@ -16,6 +16,7 @@ from vg2gt.types import Cameras, Hints
 
 BUILT_IN = ("oracle", "sweep", "vggt_tiny", "da3_tiny", "onnx")
 EXAMPLE = "examples.backend.LocalDepthBackend"
+ITERMVS = "examples.backends.itermvs.IterMVSBackend"
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -25,7 +26,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     if "backend" in metafunc.fixturenames:
         chosen = metafunc.config.getoption("--backend", default=None)
-        metafunc.parametrize("backend", [chosen] if chosen else [*BUILT_IN, EXAMPLE], indirect=True, scope="session")
+        names = [chosen] if chosen else [*BUILT_IN, EXAMPLE, ITERMVS]
+        metafunc.parametrize("backend", names, indirect=True, scope="session")
 
 
 @pytest.fixture(scope="session")
@@ -35,7 +37,8 @@ def backend(request: pytest.FixtureRequest):
     if request.param in BUILT_IN:
         return make_backend(request.param)
     module, _, name = request.param.rpartition(".")
-    return getattr(importlib.import_module(module), name)()
+    options = {"pretrained": False} if request.param == ITERMVS else {}
+    return getattr(importlib.import_module(module), name)(**options)
 
 
 def load_config(name: str, *overrides: str) -> DictConfig:

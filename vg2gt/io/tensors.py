@@ -23,8 +23,12 @@ def tensors_digest(state: Mapping[str, Tensor]) -> str:
     return digest.hexdigest()
 
 
-def read_tensors(path: str | Path) -> dict[str, Tensor]:
+def read_tensors(path: str | Path, entry: str | None = None) -> dict[str, Tensor]:
     """Reads named tensors from ``.safetensors``, or from a file of ``torch.save`` with any other suffix.
+
+    Args:
+        path: the file.
+        entry: key of the tensors in a file of ``torch.save`` that holds more; it need not be there.
 
     Raises:
         FileNotFoundError: if the file does not exist.
@@ -41,6 +45,8 @@ def read_tensors(path: str | Path) -> dict[str, Tensor]:
     except Exception as error:  # damage raises various errors of safetensors, unpickler, zip reader, allocator
         reason = str(error).strip().splitlines() or [type(error).__name__]
         raise FormatError(f"{path} is damaged or holds more than tensors and plain values: {reason[0]}") from error
+    if entry is not None and isinstance(state, dict) and isinstance(state.get(entry), dict):
+        state = state[entry]
     if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
         raise FormatError(f"{path} is not a mapping of names to tensors: export the bare state dict")
     return dict(state)
