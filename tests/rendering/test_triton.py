@@ -70,6 +70,17 @@ def test_equals_the_reference(kind: tuple[Mode, DepthKind], degree: int, scenes:
 
 
 @runnable
+@pytest.mark.parametrize("mode", ["rasterized", pytest.param("solid", marks=pytest.mark.slow)])
+def test_antialiased_equals_the_reference(mode: Mode) -> None:
+    gaussians, cameras = soup(10, size=0.06), pinhole((9, 11))
+    scales = gaussians.scales * torch.tensor([1.0, 1.0, 0.05])  # flat; half of them are less than a pixel wide
+    gaussians = replace(gaussians, scales=torch.cat((scales[:5], 8 * scales[5:])))
+    options = {"mode": mode, "bisections": 40, "antialiased": True}
+    expected = render_with_gradients(gaussians, cameras, implementation="dense", **options)
+    assert_same_render(render_with_gradients(gaussians, cameras, DEVICE, implementation="triton", **options), expected)
+
+
+@runnable
 def test_color_only_and_rays_with_many_hits() -> None:
     gaussians, cameras = soup(36, size=0.6), pinhole((3, 4))
     gaussians = replace(gaussians, opacities=gaussians.opacities * 0.2)

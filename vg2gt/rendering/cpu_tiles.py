@@ -158,7 +158,7 @@ def _prepare(view: _View, options: RenderOptions) -> _Lists:
     def project(block: int) -> None:
         project_block(
             block, view.means, view.quats, view.scales, view.opacities, view.pose, view.intrinsics, height, width,
-            options.lowpass, options.near, solid, records, boxes,
+            options.lowpass, options.near, solid, options.antialiased, records, boxes,
         )  # fmt: skip
 
     parallel_for(view.blocks, project)
@@ -263,8 +263,8 @@ def _backward(
         scratch = _scratch(view.means.dtype)
         project_backward_block(
             block, view.means, view.quats, view.scales, pose, view.intrinsics, height, width,
-            options.lowpass, solid, lists.counts, lists.offsets, rows, index % len(colors),
-            scratch.total, scratch.work, scratch.indices,
+            options.lowpass, solid, options.antialiased, lists.records, lists.counts, lists.offsets, rows,
+            index % len(colors), scratch.total, scratch.work, scratch.indices,
             means, quats, scales, opacities, colors, cameras,
         )  # fmt: skip
 

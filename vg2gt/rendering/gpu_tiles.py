@@ -159,7 +159,8 @@ class _Render(torch.autograd.Function):
             kernels.project_backward_kernel[(blocks,)](
                 means, quats, scales, opacities, sh, batch, poses, intrinsics, lists.records, lists.ends, rows,
                 *grads, grad_cameras, total, views, scenes, height, width, first, some, begin,
-                lowpass=options.lowpass, solid=solid, degree=degree, cameras=of_cameras, num_warps=BLOCK // 32,
+                lowpass=options.lowpass, solid=solid, antialiased=options.antialiased, degree=degree,
+                cameras=of_cameras, num_warps=BLOCK // 32,
             )  # fmt: skip
             del rows  # frees them before the next chunk's are allocated
         grad_poses = grad_intrinsics = grad_background = None
@@ -202,8 +203,8 @@ def _list(tensors: tuple[Tensor, ...], size: tuple[int, int], options: RenderOpt
         kernels.project_kernel[(-(-total // BLOCK), views)](
             means, quats, scales, opacities, sh, batch, poses, intrinsics, background, records, rects, ends,
             total, views, scenes, height, width, across,
-            near=options.near, lowpass=options.lowpass, solid=options.mode == "solid", degree=_degree(sh),
-            num_warps=BLOCK // 32,
+            near=options.near, lowpass=options.lowpass, solid=options.mode == "solid", antialiased=options.antialiased,
+            degree=_degree(sh), num_warps=BLOCK // 32,
         )  # fmt: skip
         ends = torch.cumsum(ends, 0)
         per_view = ends[total - 1 :: total].tolist()  # the only host-device synchronisation

@@ -24,6 +24,8 @@ class RenderOptions:
             divided by alpha.
         near: near plane in scene units. Gaussians with a nearer mean are dropped; solid depth is never nearer.
         lowpass: variance in px^2 added to every screen footprint.
+        antialiased: opacity is multiplied by the ratio of a footprint's area without and with the low-pass, so that
+            what is smaller than a pixel fades instead of growing (2D filter of Mip-Splatting, `antialiased` of gsplat).
         alpha_max: upper bound of the opacity at a pixel; no gradient flows where it is reached.
         slope_floor: lower bound of ``-d ln T / dd`` in the median depth's gradient, in units of 1 / depth. It keeps
             plateaus of transmittance near one half from dominating; 0 gives the exact gradient.
@@ -40,6 +42,7 @@ class RenderOptions:
     depth: DepthKind = "median"
     near: float = 0.01
     lowpass: float = 0.3
+    antialiased: bool = False
     alpha_max: float = 0.99
     slope_floor: float = 30.0
     bisections: int = 12

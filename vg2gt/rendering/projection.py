@@ -22,7 +22,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from vg2gt.geometry.rotations import quat_to_matrix
-from vg2gt.rendering.constants import ALPHA_MIN, JACOBIAN_CLAMP
+from vg2gt.rendering.constants import ALPHA_MIN, COMPENSATION_FLOOR, JACOBIAN_CLAMP
 from vg2gt.rendering.options import RenderOptions
 from vg2gt.rendering.scenes import SceneViews
 
@@ -38,7 +38,7 @@ class Splats:
         curvature: ``[N]`` eps.
         depth: ``[N]`` z of the mean.
         precision: ``[N]`` a0, inverse variance in depth along the ray through the mean.
-        opacity: ``[N]``.
+        opacity: ``[N]``, compensated for the low-pass if antialiased.
         normal: ``[N, 3]`` unit normal of the tangent plane at the mean, facing the camera.
         color: ``[N, 3]``.
     """
@@ -94,10 +94,21 @@ def project(scene: SceneViews, options: RenderOptions) -> Splats:
         curvature=curvature,
         depth=z,
         precision=precision,
-        opacity=scene.opacities,
+        opacity=scene.opacities * _compensation(rows, options.lowpass) if options.antialiased else scene.opacities,
         normal=-F.normalize(plane, dim=-1, eps=0.0),
         color=scene.colors[0],
     )
+
+
+def _compensation(rows: Tensor, lowpass: float) -> Tensor:
+    """Returns ``sqrt(det S / det(S + lowpass I))`` ``[N]`` of the screen covariances ``S = rows rows'``.
+
+    With it the low-pass leaves a splat's integral over the image as it is (Mip-Splatting, eqn 9). ``sqrt(det S)`` is
+    the norm of the cross product of the rows: its gradient stays bounded where S is singular, at a surfel seen edge-on.
+    """
+    det = torch.linalg.cross(rows[:, 0], rows[:, 1]).square().sum(-1)
+    blurred = det + lowpass * (rows.square().sum((1, 2)) + lowpass)
+    return (det / blurred).clamp(min=COMPENSATION_FLOOR).sqrt()
 
 
 def screen_box(splats: Splats) -> tuple[Tensor, Tensor]:

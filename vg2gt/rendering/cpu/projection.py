@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from vg2gt.kernels.compiled import kernel, kernel_part
-from vg2gt.rendering.constants import ALPHA_MIN, FAST, JACOBIAN_CLAMP
+from vg2gt.rendering.constants import ALPHA_MIN, COMPENSATION_FLOOR, FAST, JACOBIAN_CLAMP
 
 BLOCK = 2048  # Gaussians per work item; fixed, because camera gradients are summed block by block
 
@@ -26,8 +26,9 @@ def rotation(w, x, y, z):
 
 @kernel(fastmath=FAST, error_model="numpy", nogil=True)
 def project_block(
-    block, means, quats, scales, opacities, pose, intrinsics, height, width, lowpass, near, solid, records, boxes
-):
+    block, means, quats, scales, opacities, pose, intrinsics, height, width, lowpass, near, solid, antialiased,
+    records, boxes,
+):  # fmt: skip
     """Writes the records and pixel boxes (x0, x1, y0, y1; ends excluded; empty if unseen) of a block of Gaussians."""
     w00, w01, w02, t0 = pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3]
     w10, w11, w12, t1 = pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3]
@@ -74,6 +75,8 @@ def project_block(
             l2 += b2 * h / scale
         det = xx * yy - xy * xy
         opacity = np.float64(opacities[i])
+        if antialiased:
+            opacity *= math.sqrt(max(((xx - lowpass) * (yy - lowpass) - xy * xy) / det, COMPENSATION_FLOOR))
         if not (det > 0 and opacity > ALPHA_MIN):
             continue
         qa, qb, qc = yy / det, -xy / det, xx / det

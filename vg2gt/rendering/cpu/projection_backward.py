@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from vg2gt.kernels.compiled import kernel, kernel_part
-from vg2gt.rendering.constants import FAST, JACOBIAN_CLAMP
+from vg2gt.rendering.constants import COMPENSATION_FLOOR, FAST, JACOBIAN_CLAMP
 from vg2gt.rendering.cpu.projection import BLOCK, rotation, whiten
 
 CHUNK = 64  # Gaussians processed at a time
@@ -65,6 +65,21 @@ def _gather(begin, end, means, quats, scales, counts, offsets, rows, total, work
         indices[found] = i
         found += 1
     return found
+
+
+@kernel_part(fastmath=FAST, error_model="numpy")
+def _compensate(work, indices, count, records, lowpass):
+    """Chains the compensated opacity's gradient to the opacity and, as rho^2 = det(I - lowpass Q), to the conic Q."""
+    for found in range(count):
+        c, g = np.uintp(found), records[indices[found]]
+        sa, sb, sc = 1 - lowpass * g[2], lowpass * g[3], 1 - lowpass * g[4]
+        share = max(sa * sc - sb * sb, COMPENSATION_FLOOR)
+        gradient = work[ROW + 9 * CHUNK + c]
+        to_share = lowpass * gradient * g[10] / share
+        work[ROW + 2 * CHUNK + c] -= 0.5 * to_share * sc
+        work[ROW + 3 * CHUNK + c] -= to_share * sb
+        work[ROW + 4 * CHUNK + c] -= 0.5 * to_share * sa
+        work[ROW + 9 * CHUNK + c] = gradient * math.sqrt(share)
 
 
 @kernel_part(fastmath=FAST, error_model="numpy")
@@ -208,7 +223,7 @@ def _scatter(
 
 @kernel(fastmath=FAST, error_model="numpy", nogil=True)
 def project_backward_block(
-    block, means, quats, scales, pose, intrinsics, height, width, lowpass, solid,
+    block, means, quats, scales, pose, intrinsics, height, width, lowpass, solid, antialiased, records,
     counts, offsets, rows, color_view, total, work, indices,
     grad_means, grad_quats, grad_scales, grad_opacities, grad_colors, grad_cameras,
 ):  # fmt: skip
@@ -227,6 +242,8 @@ def project_backward_block(
     for begin in range(block * BLOCK, end, CHUNK):
         last = min(begin + CHUNK, end)
         count = _gather(begin, last, means, quats, scales, counts, offsets, rows, total, work, indices)
+        if antialiased:
+            _compensate(work, indices, count, records, lowpass)
         _chain(work, count, pose, fx, fy, x_limit, y_limit, lowpass, 1.0 if solid else 0.0)
         _scatter(
             work, indices, count, color_view,

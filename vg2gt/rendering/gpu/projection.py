@@ -11,6 +11,7 @@ from __future__ import annotations
 import triton  # pyright: ignore[reportMissingImports]
 import triton.language as tl  # pyright: ignore[reportMissingImports]
 
+from vg2gt.rendering.constants import COMPENSATION_FLOOR
 from vg2gt.rendering.gpu.harmonics import shade
 from vg2gt.rendering.gpu.tiles import RECORD, TILE
 
@@ -30,6 +31,7 @@ _ALPHA_MIN = tl.constexpr(1.0 / 255.0)
 _MIN_SCALE = tl.constexpr(1e-10)
 _TINY = tl.constexpr(TINY)
 _CLAMP = tl.constexpr(CLAMP)
+_FLOOR = tl.constexpr(COMPENSATION_FLOOR)
 
 
 @triton.jit
@@ -59,11 +61,19 @@ def along_axis(w00, w01, w02, w10, w11, w12, w20, w21, w22, e0, e1, e2, scale, f
     return b0, b1, b2, jx, jy, (b0 * u + b1 * v + b2) / scale
 
 
+@triton.jit
+def compensation(jx0, jy0, jx1, jy1, jx2, jy2, spread, lowpass: tl.constexpr):
+    """Returns the determinant without low-pass, and the square of the factor of the opacity; ``spread`` is xx + yy."""
+    c01, c02, c12 = jx0 * jy1 - jx1 * jy0, jx0 * jy2 - jx2 * jy0, jx1 * jy2 - jx2 * jy1
+    sharp = c01 * c01 + c02 * c02 + c12 * c12
+    return sharp, tl.maximum(sharp / (sharp + lowpass * (spread - lowpass)), _FLOOR)
+
+
 @triton.jit(do_not_specialize=("total", "views", "scenes", "height", "width", "across"))
 def project_kernel(
     means, quats, scales, opacities, sh, batch, poses, intrinsics, background, records, rects, counts,
     total, views, scenes, height, width, across,
-    near: tl.constexpr, lowpass: tl.constexpr, solid: tl.constexpr, degree: tl.constexpr,
+    near: tl.constexpr, lowpass: tl.constexpr, solid: tl.constexpr, antialiased: tl.constexpr, degree: tl.constexpr,
 ):  # fmt: skip
     """Writes records, first tiles and columns, and tile counts of a block of Gaussians in one view of each scene."""
     i = tl.program_id(0) * _BLOCK + tl.arange(0, _BLOCK)
@@ -120,6 +130,10 @@ def project_kernel(
     xy = jx0 * jy0 + jx1 * jy1 + jx2 * jy2
     det = xx * yy - xy * xy
     seen &= det > 0
+    if antialiased:
+        _, share = compensation(jx0, jy0, jx1, jy1, jx2, jy2, xx + yy, lowpass)
+        opacity *= tl.sqrt(tl.where(seen, share, 1.0))
+        seen &= opacity > _ALPHA_MIN
     idet = 1.0 / tl.where(seen, det, 1.0)
     qa, qb, qc = yy * idet, -xy * idet, xx * idet
     # inverse variance a0 along the ray, p = L m / a0, tilt

@@ -11,12 +11,14 @@ from __future__ import annotations
 import triton  # pyright: ignore[reportMissingImports]
 import triton.language as tl  # pyright: ignore[reportMissingImports]
 
+from vg2gt.rendering.constants import COMPENSATION_FLOOR
 from vg2gt.rendering.gpu.harmonics import shade_backward
 from vg2gt.rendering.gpu.projection import (
     BLOCK,
     CLAMP,
     TINY,
     along_axis,
+    compensation,
     load_pose,
     rotation,
 )
@@ -29,6 +31,7 @@ _RECORD = tl.constexpr(RECORD)
 _CAMERA = tl.constexpr(CAMERA)
 _TINY = tl.constexpr(TINY)
 _CLAMP = tl.constexpr(CLAMP)
+_FLOOR = tl.constexpr(COMPENSATION_FLOOR)
 
 
 @triton.jit
@@ -50,7 +53,7 @@ def project_backward_kernel(
     means, quats, scales, opacities, sh, batch, poses, intrinsics, records, ends, rows,
     grad_means, grad_quats, grad_scales, grad_opacities, grad_sh, grad_cameras,
     total, views, scenes, height, width, first_view, some_views, base,
-    lowpass: tl.constexpr, solid: tl.constexpr, degree: tl.constexpr, cameras: tl.constexpr,
+    lowpass: tl.constexpr, solid: tl.constexpr, antialiased: tl.constexpr, degree: tl.constexpr, cameras: tl.constexpr,
 ):  # fmt: skip
     """Sums the gradient rows of a block of Gaussians over tiles and views, and adds the chained gradients.
 
@@ -140,6 +143,13 @@ def project_backward_kernel(
                 a3 *= 0.5
                 k00, k01, k10, k11 = qa * a2 + qb * a3, qa * a3 + qb * a4, qb * a2 + qc * a3, qb * a3 + qc * a4
                 s_xx, s_xy, s_yy = -(k00 * qa + k01 * qb), -(k00 * qb + k01 * qc), -(k10 * qb + k11 * qc)
+                if antialiased:  # a9 is the gradient of the log of the compensated opacity
+                    sharp, share = compensation(jx0, jy0, jx1, jy1, jx2, jy2, xx + yy, lowpass)
+                    drawn = act & (share > _FLOOR)
+                    half, isharp = tl.where(drawn, 0.5 * a9, 0.0), 1.0 / tl.where(drawn, sharp, 1.0)
+                    s_xx += half * ((yy - lowpass) * isharp - qa)
+                    s_xy += half * (-xy * isharp - qb)
+                    s_yy += half * ((xx - lowpass) * isharp - qc)
                 ia0 = 1.0 / tl.where(act, h0 * h0 + h1 * h1 + h2 * h2, 1.0)
                 e0, e1, e2 = h0 / s0 * ia0, h1 / s1 * ia0, h2 / s2 * ia0
                 p0, p1 = b00 * e0 + b01 * e1 + b02 * e2, b10 * e0 + b11 * e1 + b12 * e2
