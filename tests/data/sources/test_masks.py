@@ -10,7 +10,7 @@ from PIL import Image
 from vg2gt.data.base import DataError
 from vg2gt.data.sources.masks import mask_beside
 from vg2gt.data.sources.nerfstudio import Nerfstudio
-from vg2gt.reconstruction.pictures import find_pictures
+from vg2gt.inputs.pictures import find_pictures
 
 
 def _put(*files: Path, hidden: str = "") -> None:
