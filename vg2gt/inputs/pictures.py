@@ -6,7 +6,6 @@ import hashlib
 import importlib.util
 import itertools
 import logging
-import re
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +20,14 @@ from torch import Tensor
 
 from vg2gt.data.base import Frames
 from vg2gt.data.sources.masks import FOLDER as MASKS
-from vg2gt.data.sources.masks import joined_masks, mask_of, resized_mask, warn_without_mask
+from vg2gt.data.sources.masks import (
+    IMAGE_FOLDERS,
+    is_image_folder,
+    joined_masks,
+    mask_beside,
+    resized_mask,
+    warn_without_mask,
+)
 from vg2gt.data.sources.parsing import IMAGE_SUFFIXES
 from vg2gt.data.transforms import from_bytes, to_bytes
 from vg2gt.io.files import by_number
@@ -38,7 +44,6 @@ HEIC_SUFFIXES = (".heic", ".heif")
 _HOLDS_PICTURES = (*IMAGE_SUFFIXES, *HEIC_SUFFIXES, R3D)
 VIDEO_FRAMES = 32  # frames taken from a video by default
 IN_MEMORY = 100  # maximum number of video frames kept in memory; with more, each is decoded on demand
-IMAGE_FOLDERS = ("images", "color", "rgb", "image", "input")
 SFM_SOURCE = "structure from motion"  # prefix of the source of cameras found by it
 UNKNOWN_LENS = "unknown"  # lens of images that structure from motion has undistorted
 
@@ -101,7 +106,8 @@ def find_pictures(images: ImagesLike, max_images: int | None = None) -> list[Pic
     photos = [picture.path for picture in taken if picture.path is not None]
     masks = {place / MASKS for photo in photos for place in (photo.parent, photo.parent.parent)}
     if known := sorted(folder for folder in masks if folder.is_dir()):
-        warn_without_mask([photo.name for photo in photos if mask_file(photo) is None], len(photos), known[0], "masks")
+        lacking = [_below(photo, known[0].parent) for photo in photos if mask_beside(photo) is None]
+        warn_without_mask(lacking, len(photos), known[0], "masks")
     return with_unique_names(taken)
 
 
@@ -172,16 +178,15 @@ def frame_of(pixels: NDArray[np.uint8], mask: NDArray[np.float32] | None = None)
     return Frames(images.contiguous(), torch.zeros_like(images[:, 0]), poses, intrinsics, mask=counts)
 
 
-def mask_file(path: Path) -> Path | None:
-    """Returns the mask file of a photograph, from ``masks/`` in its folder or one folder up; None if there is none."""
-    files = [mask_of(place / MASKS, path.name) for place in (path.parent, path.parent.parent)]
-    return next((file for file in files if file is not None), None)
+def _below(path: Path, folder: Path) -> str:
+    """Returns a file's path relative to a folder, or as it is if it is elsewhere, for messages."""
+    return str(path.relative_to(folder) if folder in path.parents else path)
 
 
 def mask_for(path: Path, upright: bool = True, content: bytes | None = None) -> NDArray[np.float32] | None:
-    """Returns the pixel weights of a photograph: the product of its alpha and its mask file (:func:`mask_file`)."""
+    """Returns the pixel weights of a photograph: the product of its alpha and its mask file (:func:`mask_beside`)."""
     parts = [read_mask(path, "", content=content, upright=upright)]
-    file = mask_file(path)
+    file = mask_beside(path)
     if content is None and file is not None:
         parts.append(read_mask_file(file, "", path if upright else None))
     return joined_masks(parts)
@@ -220,8 +225,7 @@ def image_files(folder: Path) -> list[Path]:
 
 def image_folders(folder: Path) -> list[Path]:
     """Lists the image subfolders of a folder, ignoring case; reduced ones (``images_4``) come last."""
-    named = re.compile(rf"{'|'.join(IMAGE_FOLDERS)}|images_\d+", re.IGNORECASE)
-    found = [path for path in folder.iterdir() if path.is_dir() and named.fullmatch(path.name)]
+    found = [path for path in folder.iterdir() if path.is_dir() and is_image_folder(path.name)]
     order = {name: number for number, name in enumerate(IMAGE_FOLDERS)}
     return sorted(found, key=lambda path: (order.get(path.name.lower(), len(order)), by_number(path.name)))
 

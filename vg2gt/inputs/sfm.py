@@ -31,9 +31,10 @@ from PIL import Image
 from scipy.cluster.vq import kmeans2, vq
 
 from vg2gt.data.sources.colmap_model import COLMAP, model_folder_of
+from vg2gt.data.sources.masks import mask_beside
 from vg2gt.data.transforms import reduce_to_fit, to_bytes
 from vg2gt.inputs.given_cameras import LAYOUTS, recording_pictures
-from vg2gt.inputs.pictures import SFM_SOURCE, UNKNOWN_LENS, Picture, digest, mask_file
+from vg2gt.inputs.pictures import SFM_SOURCE, UNKNOWN_LENS, Picture, digest
 from vg2gt.io.colmap import EXTRA, quiet_colmap
 from vg2gt.io.errors import FormatError
 from vg2gt.io.files import read_json, whole_folder, write_json
@@ -133,7 +134,7 @@ def _key(pictures: Sequence[Picture]) -> str:
     settings = [FORMAT, IMAGE_SIDE, *features, SEED, _MODEL, _QUALITY]
     contents = []
     for picture in pictures:
-        mask = None if picture.path is None else mask_file(picture.path)
+        mask = None if picture.path is None else mask_beside(picture.path)
         hashed = [] if mask is None else [hashlib.sha256(mask.read_bytes()).hexdigest()]
         contents.append([picture.name, picture.size, digest(picture), *hashed])
     return hashlib.sha256(json.dumps([settings, contents]).encode()).hexdigest()

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
+from vg2gt.io.color import to_srgb
 from vg2gt.io.files import regular, write_bytes
 
 # Anchors of a perceptually ordered colour map, near (bright) to far (dark); interpolated linearly.
@@ -31,7 +32,7 @@ _DEPTH_ANCHORS = torch.tensor(
 BACKGROUND = (255, 255, 255, 255)  # behind transparent pixels
 
 # Pillow tries all formats, whatever the suffix, and some of them run other programs (EPS: Ghostscript).
-_FORMATS = ("PNG", "JPEG", "MPO", "PPM", "TIFF", "WEBP", "BMP", "GIF", "HEIF")
+_FORMATS = ("PNG", "JPEG", "MPO", "PPM", "TIFF", "WEBP", "BMP", "GIF", "HEIF", "AVIF")
 
 
 def open_image(file: str | Path | IO[bytes]) -> Image.Image:
@@ -52,24 +53,28 @@ def has_alpha(image: Image.Image) -> bool:
 
 
 def color_image(image: Image.Image) -> Image.Image:
-    """Converts a photograph to 8-bit RGB.
+    """Converts a photograph to 8-bit sRGB.
 
-    16-bit grey is scaled; Pillow's own conversion would clip it at 255. Transparency is composited over white, as is
-    usual for synthetic datasets.
+    Colour profiles are applied (:mod:`vg2gt.io.color`). 16-bit grey is scaled; Pillow's own conversion would clip it at
+    255. Transparency is composited over white, as is usual for synthetic datasets.
 
     Raises:
         OSError: if the range of values is unknown: 32-bit integers and floats.
     """
     grey = image.mode.startswith("I;16") or (image.mode == "I" and image.format in ("PNG", "PPM"))
     if grey:
+        info = image.info
         image = Image.fromarray((np.asarray(image, np.float32) / 257 + 0.5).astype(np.uint8))
+        image.info = info
     elif image.mode in ("I", "F"):
         kind = "32-bit integers" if image.mode == "I" else "floating-point numbers"
         raise OSError(f"the value range of a photograph of {kind} is unknown: save it with 8 or 16 bits per channel")
     if has_alpha(image):
-        image = image.convert("RGBA")
-        image = Image.alpha_composite(Image.new("RGBA", image.size, BACKGROUND), image)
-    return image.convert("RGB")
+        alpha = image.convert("RGBA").getchannel("A")
+        image = to_srgb(image).convert("RGBA")
+        image.putalpha(alpha)
+        return Image.alpha_composite(Image.new("RGBA", image.size, BACKGROUND), image).convert("RGB")
+    return to_srgb(image).convert("RGB")
 
 
 def colorize_depth(depth: Tensor, near: float, far: float) -> Tensor:

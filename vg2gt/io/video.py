@@ -19,17 +19,22 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from vg2gt.io.color import coded_to_srgb, needs_conversion
 from vg2gt.io.errors import FormatError
 from vg2gt.io.files import replacing, write_bytes
 
 if TYPE_CHECKING:
-    from av import VideoFrame  # optional
+    from av import VideoCodecContext, VideoFrame  # optional
     from av.container import InputContainer
     from av.packet import Packet
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".gif")
 _QUALITY = "18"  # constant rate factor of H.264: 0 is lossless, 23 is x264's default
 _PALETTE = 255
+_UNSPECIFIED, _BT709, _BT601 = 2, 1, 5  # matrices from YUV to RGB as PyAV numbers them
+_LIMITED = 1  # range of values of usual videos: 16 to 235
+_EXACT = 0x4 | 0x2000 | 0x40000  # FFmpeg's scaler: bicubic, chroma for every pixel, accurate rounding
+_STANDARD_LINES = 576  # rows of a video in standard definition, at most
 # Containers that hold all their frames. FFmpeg detects formats by content: a playlist under any name would make it open
 # other files of this machine.
 _CONTAINERS = "mov,matroska,avi,mpegts,mpeg,flv,asf,ogg,gif"
@@ -64,7 +69,7 @@ def read_video(path: str | Path, numbers: Container[int] | None = None) -> Itera
     with _opened(path) as container:
         for number, frame in enumerate(_decoded(container)):
             if numbers is None or number in numbers:
-                yield number, _upright(frame)
+                yield number, _upright(frame, container.streams.video[0].codec_context)
         if number < 0:
             raise FormatError(f"{path}: no frame of it can be decoded; it is truncated or damaged")
 
@@ -107,7 +112,7 @@ def read_frame(path: str | Path, number: int) -> NDArray[np.uint8]:
         container.seek(times[number], stream=container.streams.video[0])
         for frame in _decoded(container):
             if frame.pts == times[number]:
-                return _upright(frame)
+                return _upright(frame, container.streams.video[0].codec_context)
     raise FormatError(f"{path}: frame {number} cannot be decoded; the file is damaged")
 
 
@@ -200,9 +205,22 @@ def _decoded(container: InputContainer) -> Iterator[VideoFrame]:
         yield from frames
 
 
-def _upright(frame: VideoFrame) -> NDArray[np.uint8]:
-    """Converts a frame of any colour format to RGB ``[H, W, 3]``, rotated and mirrored by its display matrix."""
-    pixels = frame.reformat(format="rgb24", interpolation="BICUBIC").to_ndarray().astype(np.uint8, copy=False)
+def _pixels(frame: VideoFrame, context: VideoCodecContext) -> NDArray[np.uint8]:
+    """Converts a frame of any colour format to sRGB ``[H, W, 3]``, HLG and PQ by their transfer functions."""
+    primaries, transfer = int(context.color_primaries), int(context.color_trc)
+    untagged = frame.colorspace == _UNSPECIFIED and "yuv" in frame.format.name
+    # as players do: BT.709 in high definition, else BT.601
+    matrix = (_BT709 if frame.height > _STANDARD_LINES else _BT601) if untagged else None
+    if not needs_conversion(primaries, transfer):
+        shown = frame.reformat(format="rgb24", interpolation=_EXACT, src_colorspace=matrix)
+        return shown.to_ndarray().astype(np.uint8, copy=False)
+    deep = frame.reformat(format="rgb48le", interpolation=_EXACT, src_colorspace=matrix)
+    return coded_to_srgb(deep.to_ndarray(), primaries, transfer)
+
+
+def _upright(frame: VideoFrame, context: VideoCodecContext) -> NDArray[np.uint8]:
+    """Converts a frame to sRGB ``[H, W, 3]``, rotated and mirrored by its display matrix."""
+    pixels = _pixels(frame, context)
     matrix = frame.side_data.get("DISPLAYMATRIX")
     if matrix is None:
         return pixels
@@ -238,10 +256,15 @@ def _write_mp4(path: Path, frames: Sequence[NDArray[np.uint8]], fps: float) -> P
                 options = {"crf": _QUALITY, "x264-params": "mbtree=0"}
                 stream = container.add_stream("libx264", Fraction(f"{fps:g}"), options)
                 stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+                context = stream.codec_context
+                context.colorspace = context.color_primaries = context.color_trc = _BT709
+                context.color_range = _LIMITED
                 stream.codec_context.thread_count = 1  # several threads are not deterministic
                 for pixels in frames:
                     even = np.ascontiguousarray(pixels[:height, :width])
-                    container.mux(stream.encode(av.VideoFrame.from_ndarray(even, "rgb24")))
+                    frame = av.VideoFrame.from_ndarray(even, "rgb24")
+                    coded = frame.reformat(format="yuv420p", dst_colorspace=_BT709, dst_color_range=_LIMITED)
+                    container.mux(stream.encode(coded))
                 container.mux(stream.encode(None))
         except FFmpegError as error:
             raise OSError(error.errno, error.strerror) from error

@@ -16,20 +16,19 @@ from torch import Tensor
 from vg2gt.geometry.precision import half_precision_on_gpu
 from vg2gt.inputs.cameras import Poses, pictures_for
 from vg2gt.inputs.inputs import Views, as_given, in_order, load_views, source_of, working_order, working_size
-from vg2gt.inputs.pictures import SFM_SOURCE, ImagesLike, Picture, spread
+from vg2gt.inputs.pictures import SFM_SOURCE, ImagesLike, Picture
 from vg2gt.io.files import by_number
 from vg2gt.memory import RECONSTRUCTION, memory_advice, note_sizes
-from vg2gt.method.additions.far_shell import far_shell
 from vg2gt.model import VG2GT, Reconstructor
 from vg2gt.monitor import Monitor
 from vg2gt.outputs.saved import read_scene
 from vg2gt.reconstruction.frame import first_frame, similarity_of
 from vg2gt.reconstruction.scene import Scene
+from vg2gt.reconstruction.surroundings import with_surroundings
 from vg2gt.reconstruction.trust import pixel_trust
 from vg2gt.reconstruction.windows import WINDOWS
 from vg2gt.reconstruction.windows.run import WindowRun, device_of, gaussians_of, set_key, window_model
 from vg2gt.reconstruction.windows.store import (
-    AUTOMATIC,
     Anchor,
     finished_sets,
     key_of,
@@ -123,8 +122,7 @@ def reconstruct_with(
         else:
             parts = _at_once(model.eval(), load_views(pictures, target, monitor), monitor, calibration)
     scene = _scene(parts, pictures, renderer or Renderer(), model.backend.is_metric)
-    scene = scene if model.visibility is None or anchor else with_far_shell(scene)
-    return scene.placed()
+    return (scene if anchor else with_surroundings(scene, model.visibility is not None)).placed()
 
 
 class _Parts(NamedTuple):
@@ -186,16 +184,6 @@ def _scene(parts: _Parts, pictures: Sequence[Picture], renderer: Renderer, is_me
     )
 
 
-def with_far_shell(scene: Scene) -> Scene:
-    """Returns the scene with a far shell for pixels that no view can place."""
-    some = torch.tensor(spread(len(scene.names), min(len(scene.names), AUTOMATIC)))
-    mask = None if scene.mask is None else scene.mask[some]
-    shell = far_shell(scene.images[some], scene.depth[some], scene.cameras.to("cpu").select(some), mask)
-    if shell is None:
-        return scene
-    return replace(scene, gaussians=scene.gaussians.joined(shell.to(scene.gaussians.means.device)))
-
-
 def add_images(
     model: VG2GT, folder: Path, images: ImagesLike, renderer: Renderer, monitor: Monitor, window: int | None = None
 ) -> Scene:
@@ -234,7 +222,7 @@ def add_images(
         anchor=anchor,
     )
     scene = _joined(old, new)
-    return scene if model.visibility is None else with_far_shell(scene)
+    return with_surroundings(scene, model.visibility is not None)
 
 
 def take_out(
@@ -262,7 +250,7 @@ def take_out(
     moved = similarity_of(anchor.to_source).apply_gaussians(gaussians)
     scene = replace(_with_views(old, left), gaussians=moved)
     mark_taken_out(place)
-    return scene if model.visibility is None else with_far_shell(scene)
+    return with_surroundings(scene, model.visibility is not None)
 
 
 def _anchor(model: VG2GT, folder: Path) -> Anchor:

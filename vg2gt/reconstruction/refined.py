@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from vg2gt.monitor import Monitor
+from vg2gt.reconstruction.surroundings import without_debris
 from vg2gt.refinement import Observations, RefineOptions, refine
 
 if TYPE_CHECKING:
@@ -48,7 +49,8 @@ def refine_scene(
             advance(100 * done, f"{psnr:.2f} dB")
 
         refined = refine(scene.gaussians, scene.cameras, seen, scene.renderer, options, observe, clock)
-    return replace(scene, gaussians=refined.scene.gaussians, cameras=refined.scene.cameras, refined=refined)
+    made = replace(scene, gaussians=refined.scene.gaussians, cameras=refined.scene.cameras, refined=refined)
+    return without_debris(made)
 
 
 def refinement_figures(scene: Scene) -> dict[str, Any]:

@@ -48,7 +48,7 @@ class COLMAP(FileSource):
 
     layout = "a COLMAP model in sparse/0 or sparse and its images/, there or up to two folders deeper"
     names_are_paths = True
-    index_version = 5
+    index_version = 6
     index_options = ("images", "has_depth")
     sparse_depth = True
     reads_masks = True
@@ -93,7 +93,7 @@ class COLMAP(FileSource):
                 f"scene {scene}: none of the model's {len(records)} images is in {folder / self.images}; {names}. Copy "
                 "them there, or set data.images to the name of their folder"
             )
-        masks = find_masks(folder / MASKS, {i: records[i].name for i in color}, f"scene {scene}")
+        masks = find_masks(folder / MASKS, {i: records[i].name for i in color}, color, f"scene {scene}")
         poses = {i: invert_pose(colmap_pose(record)) for i, record in enumerate(records)}
         posed: dict[int, PosedImage] = {}
         for i, path in color.items():

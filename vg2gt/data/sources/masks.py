@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -10,11 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from vg2gt.data.sources.parsing import IMAGE_SUFFIXES
+from vg2gt.io.errors import DataError
 from vg2gt.io.image_files import Size
 
 log = logging.getLogger(__name__)
 
 FOLDER = "masks"
+IMAGE_FOLDERS = ("images", "color", "rgb", "image", "input")
 _ENDINGS = tuple(each for ending in (".png", ".jpg", ".jpeg", ".bmp") for each in (ending, ending.upper()))
 
 
@@ -30,17 +34,71 @@ def mask_of(folder: Path, name: str) -> Path | None:
     return next((path for path in candidates if path.is_file()), None)
 
 
-def find_masks(folder: Path, names: Mapping[int, str], where: str) -> dict[int, Path]:
+def mask_beside(image: Path) -> Path | None:
+    """Finds the mask of an image in a folder ``masks`` next to it or up to three folders higher.
+
+    ``A/images/front/1.jpg`` has the mask ``A/masks/front/1.png``. ``A/masks/1.png`` is also taken, unless other folders
+    next to ``front`` have an image of that name.
+
+    Raises:
+        DataError: if the mask may be that of another image of the same name.
+    """
+    path = image.absolute()
+    for folder in path.parents[:3]:
+        parts = path.relative_to(folder).parts
+        if not (folder / FOLDER).is_dir():
+            continue
+        for dropped in range(len(parts) if len(parts) < 3 or is_image_folder(parts[0]) else 1):
+            mask = mask_of(folder / FOLDER, "/".join(parts[dropped:]))
+            if mask is not None:
+                _check_owner(mask, folder, parts, dropped)
+                return mask
+    return None
+
+
+def _check_owner(mask: Path, folder: Path, parts: Sequence[str], dropped: int) -> None:
+    """Raises DataError if a mask found without the first ``dropped`` parts of an image's path fits other images too."""
+    other = None
+    for place, part in enumerate(parts[:dropped]):
+        if is_image_folder(part):  # next to it are depth, reduced copies and the like
+            continue
+        above, rest = folder.joinpath(*parts[:place]), Path(*parts[place + 1 :])
+        places = [each for each in above.iterdir() if each.is_dir() and each.name not in (part, FOLDER)]
+        other = other or next((found for each in places if (found := _same_stem(each / rest))), None)
+    own = folder.joinpath(*parts)
+    if mask.stem != own.name and mask.name != own.name:
+        other = other or _same_stem(own, own.suffix)
+    if other is not None:
+        better = folder / FOLDER / Path(*[part for part in parts[:-1] if not is_image_folder(part)]) / f"{own.name}.png"
+        raise DataError(f"{mask} may be the mask of {own} or of {other}: name them {better} and so on")
+
+
+def _same_stem(image: Path, but: str = "") -> Path | None:
+    """Returns an image of the same name with any ending, other than ``but``; None if there is none."""
+    endings = [each for suffix in IMAGE_SUFFIXES for each in (suffix, suffix.upper()) if each.lower() != but.lower()]
+    return next((found for ending in endings if (found := image.with_suffix(ending)).is_file()), None)
+
+
+def is_image_folder(name: str) -> bool:
+    """Returns whether a folder has a name of images (``images``, ``color``, ...) or of reduced ones (``images_4``)."""
+    return re.fullmatch(rf"{'|'.join(IMAGE_FOLDERS)}|images_\d+", name, re.IGNORECASE) is not None
+
+
+def find_masks(folder: Path, names: Mapping[int, str], images: Mapping[int, Path], where: str) -> dict[int, Path]:
     """Finds the masks of images by frame number. If the folder exists, warns about images without a mask.
 
     Args:
         folder: folder of masks; need not exist.
         names: image names by frame number, relative to the image folder.
+        images: image files by frame number, whose own masks (:func:`mask_beside`) are taken if there is none by name.
         where: the scene, for the message.
+
+    Raises:
+        DataError: if a mask may be that of another image of the same name.
     """
-    if not folder.is_dir():
+    found = {number: mask_of(folder, name) or mask_beside(images[number]) for number, name in names.items()}
+    if not folder.is_dir() and not any(found.values()):
         return {}
-    found = {number: mask_of(folder, name) for number, name in names.items()}
     warn_without_mask([names[number] for number, path in found.items() if path is None], len(names), folder, where)
     return {number: path for number, path in found.items() if path is not None}
 

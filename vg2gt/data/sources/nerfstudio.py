@@ -48,7 +48,7 @@ class Nerfstudio(FileSource):
 
     layout = f"{FILE}, or Blender's {', '.join(BLENDER)}, there or up to two folders deeper"
     names_are_paths = True
-    index_version = 5
+    index_version = 6
     index_options = ("has_depth",)
     reads_masks = True
     is_metric = False
@@ -86,9 +86,8 @@ class Nerfstudio(FileSource):
             masks = _named_files(folder, records, "mask_path", where)
         if not masks:
             counts = Counter(path.name for path in color.values())
-            inside = {i: "/".join(Path(records[i].file_path).parts[1:]) for i in color}  # for the cameras of a rig
-            names = {i: path.name if counts[path.name] == 1 else inside[i] for i, path in color.items()}
-            masks = find_masks(folder / MASKS, names, f"scene {scene}")
+            names = {i: path.name if counts[path.name] == 1 else records[i].file_path for i, path in color.items()}
+            masks = find_masks(folder / MASKS, names, color, f"scene {scene}")
         if not color:
             tried = f"; tried {named[0]} and other endings" if named else ""
             raise DataError(f"scene {scene}: none of the {len(records)} images of {where} exists{tried}")

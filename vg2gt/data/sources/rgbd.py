@@ -27,8 +27,7 @@ from typing_extensions import Unpack
 from vg2gt.data.base import DataError
 from vg2gt.data.sources.files import FileOptions, FileSource
 from vg2gt.data.sources.index import SceneIndex, check_found, first_size, make_index
-from vg2gt.data.sources.masks import FOLDER as MASKS
-from vg2gt.data.sources.masks import joined_masks, mask_of
+from vg2gt.data.sources.masks import joined_masks, mask_beside
 from vg2gt.data.sources.parsing import (
     IMAGE_SUFFIXES,
     check_intrinsics,
@@ -146,13 +145,13 @@ class RGBDFolder(FileSource):
         return pixels
 
     def read_mask(self, index: SceneIndex, row: int) -> NDArray[np.float32] | None:
-        """Reads the pixel weights from alpha and from ``masks/`` in the images' folder or next to it; None: all 1."""
+        """Reads the pixel weights from alpha and from ``masks/`` (``mask_beside``); None: all 1."""
         color = index.color[row]
         if color.suffix.lower() not in IMAGE_SUFFIXES or not color.is_file():  # a part of a video or an archive
             return None
-        files = [mask_of(place / MASKS, color.name) for place in (color.parent, color.parent.parent)]
-        masks = [read_mask_file(file, index.name) for file in files if file is not None]
-        return joined_masks([read_mask(color, index.name), *masks[:1]])
+        file = mask_beside(color)
+        mask = None if file is None else read_mask_file(file, index.name)
+        return joined_masks([read_mask(color, index.name), mask])
 
     def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
         """Decodes depth: floats in metres, or integers in units of ``depth_scale``; 0 where the confidence is 0."""

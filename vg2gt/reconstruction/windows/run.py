@@ -11,10 +11,11 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
+from vg2gt.data.sources.masks import mask_beside
 from vg2gt.geometry.cameras import crop_intrinsics, scale_translations
 from vg2gt.geometry.precision import half_precision_on_gpu
 from vg2gt.inputs.inputs import thumbnails, working_order
-from vg2gt.inputs.pictures import Picture, mask_file
+from vg2gt.inputs.pictures import Picture
 from vg2gt.io.files import write_json
 from vg2gt.io.tensors import read_tensors
 from vg2gt.memory import note_sizes
@@ -300,7 +301,7 @@ def set_key(
 def _facts(picture: Picture) -> list[Any]:
     """Returns what identifies a picture's content and camera, as JSON values."""
     path = picture.path
-    files = [path, None if path is None else mask_file(path), picture.container]
+    files = [path, None if path is None else mask_beside(path), picture.container]
     states = [file.stat() for file in files if file is not None]
     matrices = [None if each is None else each.tolist() for each in (picture.pose, picture.intrinsics)]
     stamps = [[state.st_size, state.st_mtime_ns] for state in states]
