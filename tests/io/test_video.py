@@ -107,11 +107,14 @@ def test_what_cannot_be_written_or_read(tmp_path: Path) -> None:
     for said, name, frames, fps in (
         ("at least one frame", "none.gif", [], 12),
         ("one size", "two.gif", [*_frames(1), *_frames(1, (16, 16))], 12),
+        ("at least one frame", "none.mp4", [], 12),
+        ("one size", "two.mp4", [*_frames(1), *_frames(1, (16, 16))], 12),
         ("fps", "still.gif", _frames(), 0),
         (r"\.gif or \.mp4", "film.avi", _frames(), 12),
     ):
         with pytest.raises(ValueError, match=said):
             write_video(tmp_path / name, frames, fps=fps)
+    assert not list(tmp_path.iterdir())
     (tmp_path / "text.gif").write_text("no picture")
     with pytest.raises(FormatError, match="not a readable video"):
         list(read_video(tmp_path / "text.gif"))

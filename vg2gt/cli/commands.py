@@ -39,8 +39,8 @@ COMMANDS = {
         "optimises a reconstructed scene on its own images", "vg2gt refine outputs/photos --seconds 60 --holdout 8"
     ),
     "render": Command(
-        "renders a scene from the cameras of a cameras.json",
-        "vg2gt render scene.ply --cameras cameras.json --save color.png --out views",
+        "renders a scene from given cameras, or a video of it",
+        "vg2gt render outputs/photos --orbit --size 1920x1080 --save video.mp4",
     ),
     "view": Command(
         "writes a scene as one page for the browser",

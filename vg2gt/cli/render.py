@@ -1,36 +1,56 @@
-"""``vg2gt render``: renders a scene file from given cameras: colour, depth, normals, an animation."""
+"""``vg2gt render``: renders a scene: colour, depth and normals of given cameras, or a video along a path."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from vg2gt.cli.arguments import add_common_flags, flag_parser, listing
 from vg2gt.cli.errors import errors_in_one_line
 from vg2gt.outputs.output_names import FPS, MAPS
 
 OUTPUTS = {**MAPS, "video.gif": "the colour of all views as an animation", "video.mp4": "the same as H.264"}
-DEFAULT = ("color.png",)
+DEFAULT, MOVING = ("color.png",), ("video.mp4",)
+COLORS = {"color.png", "video.gif", "video.mp4"}  # outputs that need no depth and normals
+CAMERAS = "cameras.json"  # next to the scene, as vg2gt reconstruct writes it
+NOTES = {
+    "orbit": "an orbit around what the cameras look at",
+    "swing": "an orbit to and fro, because the cameras stand on one side of what they look at",
+    "path": "a path through the cameras",
+    "file": "the frames of the file",
+}
+MAX_SIZE = 16384
+
+if TYPE_CHECKING:
+    from vg2gt.io.cameras_json import NamedCamera
+    from vg2gt.rendering import Renderer
+    from vg2gt.types import Gaussians
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Runs the command; errors are reported in one line."""
     arguments = flag_parser("render", listing(OUTPUTS))
     add = arguments.add_argument
-    add("scene", help="scene.ply or .spz")
-    add(
-        "--cameras",
-        required=True,
-        metavar="PATH",
-        help="cameras.json, transforms.json, or a COLMAP model's folder",
-    )
-    add("--out", required=True, metavar="DIR", help="where to write")
+    add("scene", help="a scene's folder, scene.ply or .spz")
+    motion = arguments.add_mutually_exclusive_group().add_argument
+    motion("--cameras", metavar="PATH", help="cameras.json, transforms.json, or a COLMAP model's folder; default: the "
+        "cameras.json next to the scene")  # fmt: skip
+    motion("--orbit", action="store_true", help="turn around what the cameras look at, or follow them inside a room; "
+        "writes video.mp4 by default, like --path")  # fmt: skip
+    motion("--path", metavar="FILE", help="nerfstudio's camera_path.json, or cameras (such as views saved by the "
+        "viewer) to move through")  # fmt: skip
+    add("--out", metavar="DIR", help="where to write; default: the scene's folder")
+    add("--size", type=_size, metavar="WxH", help="width and height; default: those of the cameras, 1280x720 of videos")
+    add("--seconds", type=float, metavar="S", help="duration of --orbit or --path; default: by its length")
     add("--depth", choices=("median", "expected"), default="median", help="expected requires --mode rasterized")
     add("--interpolate", type=int, metavar="N", help="interpolate smoothly, with N new cameras between each pair")
-    add("--fps", type=float, default=FPS, help=f"frame rate of the animation, default {FPS:g}")
+    add("--fps", type=float, help=f"frames per second; default: those of camera_path.json, else {FPS:g}")
     add("--near", type=float, help="near plane in scene units; default: that of report.json next to it, else 0.01")
     add_common_flags(arguments, DEFAULT)
+    arguments.set_defaults(save=None)
     options = arguments.parse_args(argv)
     with errors_in_one_line():
         run(options)
@@ -43,32 +63,85 @@ def run(options: argparse.Namespace) -> None:
     from vg2gt.io.video import require_pyav
     from vg2gt.monitor import Monitor
     from vg2gt.outputs.outputs import animation, check_folder, check_outputs, cost_figures, feed, map_folder
-    from vg2gt.outputs.saved import near_of
+    from vg2gt.outputs.saved import near_of, scene_file
     from vg2gt.reconstruction.scene import render_views
     from vg2gt.rendering import Renderer
     from vg2gt.runs.load import choose_device
 
-    outputs = options.save
+    moving = options.orbit or options.path is not None
+    outputs = list(MOVING if moving else DEFAULT) if options.save is None else options.save
     check_outputs(outputs, OUTPUTS)
     if "video.mp4" in outputs:
         require_pyav("writing video.mp4")
-    cameras = read_cameras(options.cameras)
-    if not cameras:
-        raise ValueError(f"{options.cameras} names no camera; there is nothing to render")
-    cameras = cameras if options.interpolate is None else interpolate(cameras, options.interpolate)
-    gaussians = read_gaussians(options.scene).to(choose_device(options.device))
+    if not moving and options.seconds is not None:
+        raise ValueError("--seconds requires --orbit or --path; --fps sets the speed of views as they are")
+    if moving and options.interpolate is not None:
+        raise ValueError("--interpolate is for views as they are; --seconds and --fps set the frames of a path")
+    scene = scene_file(options.scene)
+    folder = check_folder(options.out or scene.parent, outputs, options.overwrite)
+    gaussians = read_gaussians(scene).to(choose_device(options.device))
     if not len(gaussians):
-        raise ValueError(f"{options.scene} holds no Gaussians; there is nothing to render")
-    near = near_of(Path(options.scene).parent, Renderer().near) if options.near is None else options.near
+        raise ValueError(f"{scene} holds no Gaussians; there is nothing to render")
+    near = near_of(scene.parent, Renderer().near) if options.near is None else options.near
     renderer = Renderer(mode=options.mode, depth=options.depth, near=near)
-    folder = check_folder(options.out, outputs, options.overwrite)
+    cameras, fps, note = _moving(options, scene, gaussians, renderer) if moving else _still(options, scene)
+    if not set(outputs) - COLORS:
+        renderer = replace(renderer, geometry=False)
     folder.mkdir(parents=True, exist_ok=True)
     sinks = [map_folder(folder, name) for name in outputs if name in MAPS]
-    sinks += [animation(folder / name, options.fps) for name in outputs if name.startswith("video")]
+    sinks += [animation(folder / name, fps) for name in outputs if name.startswith("video")]
     monitor = Monitor(show=not options.quiet, device=gaussians.means.device)
     with monitor, monitor.stage("render views", len(cameras)) as advance:
         feed(render_views(renderer, gaussians, cameras), sinks, advance)
     cost = cost_figures(monitor)
     seconds = sum(cost["seconds"].values())
     print(f"{len(cameras)} views of {len(gaussians)} Gaussians: {seconds:.1f} s, peak {cost['peak_memory_mib']} MiB")
+    if note:
+        print(f"{note}, {len(cameras) / fps:.1f} s at {fps:g} frames per second")
     print(f"written: {', '.join(str(folder / name) for name in outputs)}")
+
+
+def _still(options: argparse.Namespace, scene: Path) -> tuple[list[NamedCamera], float, str]:
+    """Returns the cameras of a file as they are, the frame rate of an animation, and no note."""
+    from vg2gt.reconstruction.camera_files import interpolate, read_cameras
+    from vg2gt.reconstruction.camera_path import resized
+
+    source = options.cameras or scene.parent / CAMERAS
+    if options.cameras is None and not source.is_file():
+        raise ValueError(f"{scene.parent} has no {CAMERAS}: choose the cameras with --cameras, --orbit or --path")
+    cameras = read_cameras(source)
+    if not cameras:
+        raise ValueError(f"{source} names no camera; there is nothing to render")
+    if options.size is not None:
+        cameras = [resized(camera, options.size) for camera in cameras]
+    if options.interpolate is not None:
+        cameras = interpolate(cameras, options.interpolate)
+    return cameras, options.fps or FPS, ""
+
+
+def _moving(
+    options: argparse.Namespace, scene: Path, gaussians: Gaussians, renderer: Renderer
+) -> tuple[list[NamedCamera], float, str]:
+    """Returns the cameras of the frames of an orbit or a path, the frame rate, and what the path is."""
+    from vg2gt.reconstruction.camera_files import read_cameras
+    from vg2gt.reconstruction.camera_path import SIZE, glide, median_depth, orbit, read_camera_path
+
+    size, fps = options.size or SIZE, options.fps or FPS
+    if options.path is None:
+        known = scene.parent / CAMERAS
+        found = orbit(gaussians, read_cameras(known) if known.is_file() else [], renderer, size, fps, options.seconds)
+    elif found := read_camera_path(options.path, options.size, options.fps):
+        if options.seconds is not None:
+            raise ValueError(f"{options.path} sets the duration by its frames: leave --seconds away, or change --fps")
+    else:
+        cameras = read_cameras(options.path)
+        unit = median_depth(gaussians, cameras, renderer) or 1.0
+        found = glide(cameras, unit, size, fps, options.seconds)
+    return found.cameras, found.fps, NOTES[found.kind]
+
+
+def _size(text: str) -> tuple[int, int]:
+    sides = text.lower().split("x")
+    if len(sides) != 2 or not all(side.isdigit() and 0 < int(side) <= MAX_SIZE for side in sides):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a width and height such as 1920x1080")
+    return int(sides[1]), int(sides[0])

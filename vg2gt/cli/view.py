@@ -26,7 +26,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Writes the page; wrong arguments or files are reported in one line."""
     parser = flag_parser("view")
     add = parser.add_argument
-    add("scene", type=Path, help="scene.ply or .spz")
+    add("scene", type=Path, help="a scene's folder, scene.ply or .spz")
     add("--cameras", type=Path, help="cameras, the first is the initial view; default: cameras.json next to the scene")
     add("--images", type=Path, help="folder of the cameras' images; default: that of cameras.json, or views.npz in it")
     add("--color", choices=("trust",), help="trust: colour by stated error and status of a scene.ply written by vg2gt")
@@ -34,6 +34,10 @@ def main(argv: Sequence[str] | None = None) -> None:
     add("--open", action="store_true", help="open the page in the browser")
     add("--title", help="title of the page; default: the scene's name, of scene.ply its folder's")
     arguments = parser.parse_args(argv)
+    with errors_in_one_line():
+        from vg2gt.reconstruction.saved import scene_file
+
+        arguments.scene = scene_file(arguments.scene)
     known = arguments.scene.parent / CAMERAS
     if arguments.cameras is None and known.is_file():
         arguments.cameras = known

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from vg2gt.geometry.cameras import unproject
@@ -32,7 +31,7 @@ from vg2gt.io import (
 )
 from vg2gt.io.files import whole_folder, write_bytes, write_json
 from vg2gt.io.images import colorize_depth, colorize_normals, grid, to_pixels, write_png
-from vg2gt.io.video import write_video
+from vg2gt.io.video import video_writer
 from vg2gt.inputs.camera_files import view_stem
 from vg2gt.outputs.export import exported_views
 from vg2gt.monitor import Monitor
@@ -186,14 +185,13 @@ def map_folder(folder: Path, output: str) -> Iterator[AddView]:
 
 @contextmanager
 def animation(path: Path, fps: float) -> Iterator[AddView]:
-    """Collects the colour of the views and writes an animation, ``.gif`` or ``.mp4``, at ``fps`` frames per second.
+    """Writes the colour of the views as an animation, ``.gif`` or ``.mp4``, at ``fps`` frames per second.
 
     Raises:
-        MissingDecoderError: if it is not a GIF and PyAV is not installed.
+        ImportError: if it is not a GIF and PyAV is not installed.
     """
-    frames: list[NDArray[np.uint8]] = []
-    yield lambda view: frames.append(to_pixels(view.color))
-    write_video(path, frames, fps)
+    with video_writer(path, fps) as add:
+        yield lambda view: add(to_pixels(view.color))
 
 
 def feed(views: Iterable[RenderedView], sinks: Sequence[Sink], advance: Callable[[], None]) -> None:

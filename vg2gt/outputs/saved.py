@@ -66,6 +66,21 @@ def read_scene(folder: str | Path, renderer: Renderer, device: torch.device | st
     )
 
 
+def scene_file(path: str | Path) -> Path:
+    """Returns the scene's file if ``path`` is the folder of a scene, else ``path`` itself.
+
+    Raises:
+        FileNotFoundError: if the folder has neither ``scene.ply`` nor ``scene.spz``.
+    """
+    path = Path(path).expanduser()
+    if not path.is_dir():
+        return path
+    for name in ("scene.ply", "scene.spz"):
+        if (path / name).is_file():
+            return path / name
+    raise FileNotFoundError(f"{path} has no scene.ply or scene.spz: give a scene's file or a folder with one")
+
+
 def near_of(folder: Path, default: float) -> float:
     """Returns the near plane of the scene in a folder, if its ``report.json`` has one, else the default."""
     file = folder / "report.json"
