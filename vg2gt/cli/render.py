@@ -79,12 +79,13 @@ def run(options: argparse.Namespace) -> None:
         raise ValueError("--interpolate is for views as they are; --seconds and --fps set the frames of a path")
     scene = scene_file(options.scene)
     folder = check_folder(options.out or scene.parent, outputs, options.overwrite)
+    still = None if moving else _still(options, scene)
     gaussians = read_gaussians(scene).to(choose_device(options.device))
     if not len(gaussians):
         raise ValueError(f"{scene} holds no Gaussians; there is nothing to render")
     near = near_of(scene.parent, Renderer().near) if options.near is None else options.near
     renderer = Renderer(mode=options.mode, depth=options.depth, near=near)
-    cameras, fps, note = _moving(options, scene, gaussians, renderer) if moving else _still(options, scene)
+    cameras, fps, note = still or _moving(options, scene, gaussians, renderer)
     if not set(outputs) - COLORS:
         renderer = replace(renderer, geometry=False)
     folder.mkdir(parents=True, exist_ok=True)
