@@ -246,7 +246,7 @@ def test_interrupted_video_leaves_nothing(folder: Path, monkeypatch: pytest.Monk
             raise KeyboardInterrupt
         return np.zeros((36, 64, 3), np.uint8)
 
-    monkeypatch.setattr("vg2gt.reconstruction.outputs.to_pixels", third_is_interrupted)
+    monkeypatch.setattr("vg2gt.outputs.outputs.to_pixels", third_is_interrupted)
     with pytest.raises(SystemExit):
         run(folder, "--orbit", "--size", "64x36", "--overwrite")
     assert (folder / "video.mp4").read_text() == "the former one"

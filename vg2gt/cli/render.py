@@ -58,7 +58,6 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Renders the views and writes the outputs."""
-    from vg2gt.inputs.camera_files import interpolate, read_cameras
     from vg2gt.io import read_gaussians
     from vg2gt.io.video import require_pyav
     from vg2gt.monitor import Monitor
@@ -104,7 +103,7 @@ def run(options: argparse.Namespace) -> None:
 
 def _still(options: argparse.Namespace, scene: Path) -> tuple[list[NamedCamera], float, str]:
     """Returns the cameras of a file as they are, the frame rate of an animation, and no note."""
-    from vg2gt.reconstruction.camera_files import interpolate, read_cameras
+    from vg2gt.inputs.camera_files import interpolate, read_cameras
     from vg2gt.reconstruction.camera_path import resized
 
     source = options.cameras or scene.parent / CAMERAS
@@ -124,7 +123,7 @@ def _moving(
     options: argparse.Namespace, scene: Path, gaussians: Gaussians, renderer: Renderer
 ) -> tuple[list[NamedCamera], float, str]:
     """Returns the cameras of the frames of an orbit or a path, the frame rate, and what the path is."""
-    from vg2gt.reconstruction.camera_files import read_cameras
+    from vg2gt.inputs.camera_files import read_cameras
     from vg2gt.reconstruction.camera_path import SIZE, glide, median_depth, orbit, read_camera_path
 
     size, fps = options.size or SIZE, options.fps or FPS

@@ -35,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     add("--title", help="title of the page; default: the scene's name, of scene.ply its folder's")
     arguments = parser.parse_args(argv)
     with errors_in_one_line():
-        from vg2gt.reconstruction.saved import scene_file
+        from vg2gt.outputs.saved import scene_file
 
         arguments.scene = scene_file(arguments.scene)
     known = arguments.scene.parent / CAMERAS

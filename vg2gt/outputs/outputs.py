@@ -14,6 +14,8 @@ import torch
 from torch import Tensor
 
 from vg2gt.geometry.cameras import unproject
+from vg2gt.inputs.camera_files import view_stem
+from vg2gt.inputs.pictures import spread
 from vg2gt.io import (
     Lens,
     Transforms,
@@ -32,11 +34,9 @@ from vg2gt.io import (
 from vg2gt.io.files import whole_folder, write_bytes, write_json
 from vg2gt.io.images import colorize_depth, colorize_normals, grid, to_pixels, write_png
 from vg2gt.io.video import video_writer
-from vg2gt.inputs.camera_files import view_stem
-from vg2gt.outputs.export import exported_views
 from vg2gt.monitor import Monitor
+from vg2gt.outputs.export import exported_views
 from vg2gt.outputs.output_names import DEFAULT, MAPS, OUTPUTS, PREDICTED
-from vg2gt.inputs.pictures import spread
 from vg2gt.reconstruction.refined import refinement_figures
 from vg2gt.reconstruction.trust import trust_figures, trust_picture
 from vg2gt.visibility import Status, point_support

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import torch
 
+from vg2gt.inputs.camera_files import view_stem
 from vg2gt.io import read_cameras_json, read_gaussian_ply
 from vg2gt.io.arrays import read_npz
 from vg2gt.io.cameras_json import NamedCamera
 from vg2gt.io.errors import FormatError
 from vg2gt.io.files import read_json
-from vg2gt.inputs.camera_files import view_stem
-from vg2gt.reconstruction.frame import SceneFrame
 from vg2gt.outputs.output_names import PREDICTED
+from vg2gt.reconstruction.frame import SceneFrame
 from vg2gt.reconstruction.scene import Scene
 from vg2gt.rendering import Renderer
 from vg2gt.types import Cameras

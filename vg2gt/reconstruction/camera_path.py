@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from scipy.interpolate import splev, splprep
 from scipy.spatial.transform import Rotation
 
+from vg2gt.inputs.pictures import spread
 from vg2gt.io.cameras_json import Fields, NamedCamera, check_rigid, invert_pose
 from vg2gt.io.errors import FormatError
 from vg2gt.io.files import read_json
 from vg2gt.reconstruction.frame import upright_rotation
-from vg2gt.reconstruction.pictures import spread
 from vg2gt.rendering import Renderer
 from vg2gt.types import Gaussians
 
