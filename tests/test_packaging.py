@@ -24,6 +24,7 @@ def test_installed_wheel_trains_from_an_empty_folder(tmp_path: Path, cache: Path
     subprocess.run(making, cwd=ROOT, check=True, capture_output=True)
     (wheel,) = (tmp_path / "dist").glob("*.whl")
     members = zipfile.ZipFile(wheel).namelist()
+    assert {path.relative_to(ROOT).as_posix() for path in ROOT.glob("vg2gt/**/*.py")} <= set(members)
     assert "vg2gt/configs/train.yaml" in members
     assert "backends/oracle.py" in members
     assert "vg2gt/viewer/static/page.html" in members
