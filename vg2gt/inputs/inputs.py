@@ -111,15 +111,27 @@ def load_views(pictures: Sequence[Picture], size: tuple[int, int], monitor: Moni
 def photo_of(camera: NamedCamera, picture: Picture) -> Photo:
     """Returns the camera of a view's whole photograph from the view's camera (inverse of ``resize_to_cover``)."""
     name = camera.name if picture.path is None else picture.path.name
-    height, width = picture.size
-    scale = max(camera.height / height, camera.width / width)
-    covering = [
-        max(least, math.floor(side * scale + 0.5)) for least, side in ((camera.height, height), (camera.width, width))
-    ]
-    room = ((covering[0] - camera.height) // 2, (covering[1] - camera.width) // 2)
-    matrix = crop_intrinsics(torch.from_numpy(camera.intrinsics), -room[1], -room[0])
-    matrix = resize_intrinsics(matrix, width / covering[1], height / covering[0])
-    return Photo(name, width, height, matrix.numpy(), picture.lens)
+    matrix = photo_intrinsics(torch.from_numpy(camera.intrinsics), (camera.height, camera.width), picture.size)
+    return Photo(name, picture.size[1], picture.size[0], matrix.numpy(), picture.lens)
+
+
+def photo_intrinsics(intrinsics: Tensor, size: tuple[int, int], photo: tuple[int, int]) -> Tensor:
+    """Returns the intrinsics of a whole photograph from those of its view.
+
+    Args:
+        intrinsics: ``[3, 3]`` of the view.
+        size: height and width of the view.
+        photo: height and width of the photograph.
+    """
+    covering, (top, left) = covering_size(photo, size)
+    return resize_intrinsics(crop_intrinsics(intrinsics, -left, -top), photo[1] / covering[1], photo[0] / covering[0])
+
+
+def covering_size(photo: tuple[int, int], size: tuple[int, int]) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Returns the size to which ``resize_to_cover`` resizes a photograph, and the first row and column of its crop."""
+    scale = max(size[0] / photo[0], size[1] / photo[1])
+    height, width = (max(least, math.floor(side * scale + 0.5)) for least, side in zip(size, photo, strict=True))
+    return (height, width), ((height - size[0]) // 2, (width - size[1]) // 2)
 
 
 def source_of(pictures: Sequence[Picture]) -> str:

@@ -8,14 +8,16 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from vg2gt.monitor import Monitor
+from vg2gt.reconstruction.photographs import load_photographs
 from vg2gt.reconstruction.surroundings import without_debris
-from vg2gt.refinement import Observations, RefineOptions, refine
+from vg2gt.refinement import Observations, RefineOptions, fold_of, refine, sharpened, split_views
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from vg2gt.reconstruction.scene import Scene
 
+WORKING_SHARE = 0.3  # of the time, at most, for the stage at the working size
 RECORDINGS = ("RGBDFolder", "TUM")  # their measured poses fit their depth better than bundle adjustment does
 
 
@@ -41,16 +43,28 @@ def refine_scene(
     Returns:
         The refined scene, with the same images, decoded depth and names.
     """
+    monitor, began = monitor or Monitor(), clock()
     device = scene.gaussians.means.device
     seen = Observations(scene.images, scene.depth, scene.depth_conf, scene.mask).to(device)
-    with (monitor or Monitor()).stage("refine", 100) as advance:
-
-        def observe(_: int, done: float, psnr: float) -> None:
-            advance(100 * done, f"{psnr:.2f} dB")
-
-        refined = refine(scene.gaussians, scene.cameras, seen, scene.renderer, options, observe, clock)
+    full = options.full if scene.pictures else None
+    at_working_size = options
+    if full is not None and options.seconds is not None:
+        at_working_size = replace(options, seconds=WORKING_SHARE * options.seconds)
+    fold = None if full is None else fold_of(split_views(len(scene.names), options.holdout)[0], full)
+    with monitor.stage("refine", 100) as advance:
+        observe = _shown(advance)
+        refined = refine(scene.gaussians, scene.cameras, seen, scene.renderer, at_working_size, observe, clock, fold)
+    if full is not None and refined.ended in ("steps", "seconds"):
+        photographs = load_photographs(scene.pictures, refined.scene.cameras, full.size, monitor).to(device)
+        left = None if options.seconds is None else max(0.0, options.seconds - (clock() - began))
+        with monitor.stage("refine at full size", 100) as advance:
+            refined = sharpened(refined, photographs, seen, scene.renderer, options, left, _shown(advance), clock)
     made = replace(scene, gaussians=refined.scene.gaussians, cameras=refined.scene.cameras, refined=refined)
     return without_debris(made)
+
+
+def _shown(advance: Callable[..., None]) -> Callable[[int, float, float], None]:
+    return lambda _, done, psnr: advance(100 * done, f"{psnr:.2f} dB")
 
 
 def refinement_figures(scene: Scene) -> dict[str, Any]:
@@ -64,6 +78,11 @@ def refinement_figures(scene: Scene) -> dict[str, Any]:
         "seconds": round(refined.seconds, 2),
         "ended": refined.ended,
     }
+    if (sharp := refined.sharpened) is not None:
+        height, width = sharp.scene.cameras.size
+        figures["full_size"] = {"image": [height, width], "steps": sharp.steps, "ended": sharp.ended}
+        if sharp.scores:
+            figures["full_size"] |= {"psnr_left_out": round(sharp.scores[-1], 3), "left_out": list(sharp.fold)}
     for when, state, psnr in zip(("before", "after"), (refined.start, refined.scene), refined.psnr, strict=True):
         figures[f"gaussians_{when}"] = len(state.gaussians)
         for name, views in (("trained", refined.trained), ("held_out", refined.held_out)):

@@ -14,6 +14,7 @@ from vg2gt.types import Cameras, Gaussians, Render, TensorRecord
 
 RENDERINGS = 12  # of each view, if neither steps nor seconds are set
 MIN_ALPHA = 0.5
+MIN_CROP = 16  # pixels: SSIM needs its window
 
 
 @dataclass(frozen=True)
@@ -159,6 +160,63 @@ class RefineRates:
 
 
 @dataclass(frozen=True)
+class FullSizeOptions:
+    """Options of the second stage of a refinement, on the photographs at their own size.
+
+    Each step renders a random crop. Gaussians that are larger than the pixels ask for are split. A fixed fold of the
+    views is left out at first: where it gets worse, the stage ends early. Then all views are trained.
+
+    Args:
+        size: longer side of the photographs in pixels, at most.
+        steps: maximum number of steps, if the refinement has no maximum time.
+        renderings: maximum number of times that each pixel of the photographs is rendered: more would overfit.
+        crop: longest side of a crop in pixels.
+        rate: factor on the rates of positions and colours.
+        max_gaussians: no Gaussian is split if there would be more.
+        footprint: standard deviation in pixels above which a Gaussian is split.
+        least: contribution below which a Gaussian is removed, in pixels of a view of 280.
+        grow_every: number of steps between splits.
+        grow_until: share of the stage after which no Gaussian is split.
+        fold: leave out one view of this many at first; 0: none. Fewer than six views are never left out.
+        opened: share of the stage after which all views are trained.
+
+    Raises:
+        ValueError: if an option is out of range.
+    """
+
+    size: int = 1600
+    steps: int = 1500
+    renderings: float = 40.0
+    crop: int = 320
+    rate: float = 0.5
+    max_gaussians: int = 400_000
+    footprint: float = 3.0
+    least: float = 0.3
+    grow_every: int = 150
+    grow_until: float = 0.6
+    fold: int = 8
+    opened: float = 0.7
+
+    def __post_init__(self) -> None:
+        for name, good, expected in (
+            ("size", self.size >= MIN_CROP, f"at least {MIN_CROP}"),
+            ("steps", self.steps >= 1, "at least 1"),
+            ("renderings", self.renderings > 0, "positive"),
+            ("crop", self.crop >= MIN_CROP, f"at least {MIN_CROP}"),
+            ("rate", self.rate > 0, "positive"),
+            ("max_gaussians", self.max_gaussians >= 1, "at least 1"),
+            ("footprint", self.footprint > 0, "positive"),
+            ("least", self.least >= 0, "at least 0"),
+            ("grow_every", self.grow_every >= 1, "at least 1"),
+            ("grow_until", 0 <= self.grow_until <= 1, "in [0, 1]"),
+            ("fold", self.fold == 0 or self.fold >= 2, "0 or at least 2"),
+            ("opened", 0 < self.opened < 1, "between 0 and 1"),
+        ):
+            if not good:
+                raise ValueError(f"refine.full.{name} must be {expected}, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
 class RefineOptions:
     """Options of a refinement.
 
@@ -180,6 +238,8 @@ class RefineOptions:
         seed: random seed of the view order.
         rates: learning rates.
         loss: loss to minimise.
+        full: second stage on the photographs at their own size (:class:`FullSizeOptions`), for scenes that know their
+            photographs; None: none.
 
     Raises:
         ValueError: if an option is out of range.
@@ -197,6 +257,7 @@ class RefineOptions:
     seed: int = 0
     rates: RefineRates = field(default_factory=RefineRates)
     loss: RefineLoss = field(default_factory=RefineLoss)
+    full: FullSizeOptions | None = None
 
     def __post_init__(self) -> None:
         for name, good, expected in (

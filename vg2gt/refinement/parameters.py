@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -15,6 +16,7 @@ from vg2gt.refinement.options import RefineRates
 from vg2gt.types import Cameras, Gaussians, TensorRecord
 
 BETAS = (0.9, 0.99)
+EPSILON = 1e-8  # of Adam
 HIGHER_BANDS = 0.05  # rate of the higher spherical harmonics relative to that of the constant one
 LOGIT_MARGIN = 1e-4
 TRANSPARENT = 0.02  # opacity below which Gaussians are removed
@@ -53,12 +55,13 @@ class RefinedScene(TensorRecord):
 
 
 class Parameters:
-    """Unconstrained parameters of a scene, with their optimiser.
+    """Unconstrained parameters of a scene, with Adam's moments.
 
-    Positions are offsets in units of each Gaussian's middle standard deviation, so that one rate fits small and large
-    Gaussians and every scene's unit. Cameras rotate and shift in their own frames. View 0 is optimised too: otherwise
-    an error of its pose would have to be compensated by all other views and Gaussians
-    (:meth:`RefinedScene.seen_from` restores its pose).
+    A step may concern some Gaussians only, such as those in front of a crop: the others keep values and moments, which
+    saves most of a step's time. Positions move in units of each Gaussian's middle standard deviation at the start, so
+    that one rate fits small and large Gaussians and every scene's unit. Cameras rotate and shift in their own frames.
+    View 0 is optimised too: otherwise an error of its pose would have to be compensated by all other views and
+    Gaussians (:meth:`RefinedScene.seen_from` restores its pose).
 
     Args:
         start: initial state.
@@ -67,17 +70,22 @@ class Parameters:
             ``depth``, of shifts.
         depth: median depth in scene units.
         trained: ``[N]`` views to train on; exposures of the others stay fixed.
+
+    Attributes:
+        values: the parameters by name; those of Gaussians have one row each.
+        unit: ``[G]`` unit in which positions move.
+        size: ``[G]`` largest standard deviations at the start.
+        moments: Adam's two moments by name; ``counts`` are the numbers of updates they hold, ``[G]`` or one number.
     """
 
     def __init__(self, start: RefinedScene, rates: RefineRates, pixel: float, depth: float, trained: Tensor) -> None:
         gaussians = start.gaussians
         self.start = start
         self.pixel, self.depth, self.trained = pixel, depth, trained
-        self.origin = gaussians.means
         self.unit = gaussians.scales.median(-1).values
         self.size = gaussians.scales.max(-1).values
         self.values = {
-            "means": torch.zeros_like(gaussians.means),
+            "means": gaussians.means.clone(),
             "quats": F.normalize(gaussians.quats, dim=-1),
             "scales": gaussians.scales.log(),
             "opacities": torch.logit(gaussians.opacities.clamp(LOGIT_MARGIN, 1 - LOGIT_MARGIN)),
@@ -88,22 +96,30 @@ class Parameters:
             "bias": start.bias.clone(),
         }
         self.rates = {**vars(rates), "sh_rest": HIGHER_BANDS * rates.sh, "gain": rates.exposure, "bias": rates.exposure}
-        groups = []
-        for name, value in self.values.items():
-            if self.rates[name] and value.numel():
-                groups.append({"params": [value.requires_grad_(True)], "lr": self.rates[name], "name": name})
-        self.optimizer = torch.optim.Adam(groups, betas=BETAS)
+        self.moments = {name: (torch.zeros_like(value), torch.zeros_like(value)) for name, value in self.values.items()}
+        self.counts = torch.zeros_like(self.unit)
+        self.steps = 0
+        self._rows: Tensor | None = None
+        self._leaves: dict[str, Tensor] = {}
 
-    def scene(self) -> RefinedScene:
-        """Returns the current scene with autograd graph."""
-        values, start = self.values, self.start
+    def __len__(self) -> int:
+        return len(self.unit)
+
+    def scene(self, rows: Tensor | None = None) -> RefinedScene:
+        """Returns the current scene with autograd graph; ``rows [N]``: with these Gaussians only, in this order."""
+        self._rows = rows
+        self._leaves = values = {
+            name: (value.clone() if rows is None or name not in OF_GAUSSIANS else value[rows]).requires_grad_(True)
+            for name, value in self.values.items()
+        }
+        start = self.start
         gaussians = Gaussians(
-            self.origin + self.unit[:, None] * values["means"],
+            values["means"],
             F.normalize(values["quats"], dim=-1),
             values["scales"].exp(),
             torch.sigmoid(values["opacities"]),
             torch.cat((values["sh"], values["sh_rest"]), 1),
-            torch.zeros(len(self.origin), dtype=torch.int64, device=self.origin.device),
+            torch.zeros(len(values["means"]), dtype=torch.int64, device=self.unit.device),
             start.gaussians.background,
         )
         gain, bias = self._centred(values["gain"]).exp(), self._centred(values["bias"])
@@ -117,39 +133,87 @@ class Parameters:
     def _cameras(self, cameras: Cameras) -> Cameras:
         if not self.rates["cameras"]:
             return cameras
-        moves = self.pixel * self.values["cameras"]
+        moves = self.pixel * self._leaves["cameras"]
         turn = quat_to_matrix(F.pad(moves[:, :3] / 2, (1, 0), value=1.0))
         top = torch.cat((turn, self.depth * moves[:, 3:, None]), -1)
         increment = torch.cat((top, cameras.world_to_camera[0, :, 3:]), -2)
         return replace(cameras, world_to_camera=compose(increment, cameras.world_to_camera[0])[None])
 
     def step(self, loss: Tensor, share: float) -> bool:
-        """Runs an Adam step with rates scaled by ``share``; returns False, without it, if a gradient is not finite."""
-        self.optimizer.zero_grad()
+        """Updates what the last :meth:`scene` holds by one step of Adam (Kingma & Ba, 2015).
+
+        Args:
+            loss: loss of that scene.
+            share: factor on all rates.
+
+        Returns:
+            False, without a change, if a gradient is not finite.
+        """
         loss.backward()
-        for group in self.optimizer.param_groups:
-            group["lr"] = share * self.rates[group["name"]]
-        grads = [group["params"][0].grad for group in self.optimizer.param_groups]
-        if not torch.stack([grad.sum() for grad in grads if grad is not None]).isfinite().all():
+        grads = {name: leaf.grad for name, leaf in self._leaves.items() if leaf.grad is not None and leaf.numel()}
+        if not torch.stack([grad.sum() for grad in grads.values()]).isfinite().all():
             return False
-        self.optimizer.step()
+        rows = slice(None) if self._rows is None else self._rows
+        self.steps += 1
+        self.counts[rows] += 1
+        for name, grad in grads.items():
+            if rate := share * self.rates[name]:
+                self._update(name, grad, rate, rows if name in OF_GAUSSIANS else slice(None))
         return True
+
+    def _update(self, name: str, grad: Tensor, rate: float, rows: Tensor | slice) -> None:
+        value, (first, second) = self.values[name], self.moments[name]
+        unit = self.unit[rows, None] if name == "means" else 1.0
+        grad = grad * unit
+        # a slice is updated in place; rows by an index are copied and written back
+        mean = first[rows].lerp_(grad, 1 - BETAS[0])
+        square = second[rows].mul_(BETAS[1]).addcmul_(grad, grad, value=1 - BETAS[1])
+        if name in OF_GAUSSIANS:
+            count = self.counts[rows].view(-1, *[1] * (grad.dim() - 1))
+            corrections = (1 - BETAS[0] ** count, 1 - BETAS[1] ** count)
+        else:
+            corrections = tuple(1 - beta**self.steps for beta in BETAS)
+        change = mean / corrections[0] / ((square / corrections[1]).sqrt_().add_(EPSILON)) * unit
+        if isinstance(rows, Tensor):
+            first[rows], second[rows] = mean, square
+        value[rows] -= rate * change
 
     @torch.no_grad()
     def prune(self) -> None:
-        """Removes transparent Gaussians with their Adam state, unless all are."""
+        """Removes transparent Gaussians, unless all are."""
         keep = torch.sigmoid(self.values["opacities"]) >= TRANSPARENT
-        if keep.all() or not keep.any():
-            return
-        self.origin, self.unit, self.size = self.origin[keep], self.unit[keep], self.size[keep]
-        groups = {group["name"]: group for group in self.optimizer.param_groups}
+        if not keep.all() and keep.any():
+            self.keep(keep)
+
+    def keep(self, rows: Tensor) -> None:
+        """Keeps the Gaussians of a mask or an index ``rows`` only, with their moments."""
+        self._replace(lambda values: values[rows])
+
+    @torch.no_grad()
+    def split(self, rows: Tensor, shrink: float, offset: float) -> None:
+        """Splits Gaussians in two along their longest axis.
+
+        Both halves keep the moments and the number of updates.
+
+        Args:
+            rows: ``[N]`` index of those to split; the second halves are appended in this order.
+            shrink: factor on the standard deviation along that axis.
+            offset: shift of either half from the middle, in former standard deviations.
+        """
+        scales = self.values["scales"][rows].exp()
+        axis = scales.argmax(-1)
+        turn = quat_to_matrix(F.normalize(self.values["quats"][rows], dim=-1))
+        picked = torch.arange(len(rows), device=rows.device)
+        shift = offset * turn[picked, :, axis] * scales[picked, axis][:, None]
+        self.values["scales"][rows, axis] += torch.tensor(shrink, device=rows.device).log()
+        self.values["means"][rows] += shift
+        self._replace(lambda values: torch.cat((values, values[rows])))
+        self.values["means"][-len(rows) :] -= 2 * shift
+
+    def _replace(self, change: Callable[[Tensor], Tensor]) -> None:
+        """Applies a change of rows to all that is known of the Gaussians."""
+        self.unit, self.size, self.counts = (change(each) for each in (self.unit, self.size, self.counts))
         for name in OF_GAUSSIANS:
-            before = self.values[name]
-            after = self.values[name] = before[keep].detach()
-            if name not in groups:
-                continue
-            groups[name]["params"][0] = after.requires_grad_(True)
-            state = self.optimizer.state.pop(before, None)
-            if state is not None:
-                moments = {key: state[key][keep] for key in ("exp_avg", "exp_avg_sq")}
-                self.optimizer.state[after] = {"step": state["step"], **moments}
+            self.values[name] = change(self.values[name])
+            first, second = self.moments[name]
+            self.moments[name] = (change(first), change(second))

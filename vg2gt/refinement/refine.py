@@ -16,6 +16,8 @@ from vg2gt.metrics import psnr
 from vg2gt.refinement.density import fill_holes, supported
 from vg2gt.refinement.options import Observations, RefineLoss, RefineOptions
 from vg2gt.refinement.parameters import Parameters, RefinedScene
+from vg2gt.refinement.photographs import Photographs
+from vg2gt.refinement.sharpen import Sharpened, sharpen
 from vg2gt.rendering import Renderer
 from vg2gt.types import Cameras, Gaussians
 
@@ -43,6 +45,7 @@ class Refined:
         psnr: ``[2, V]`` PSNR of every view before and after, in dB.
         trained: ``[N]`` views that were trained on.
         held_out: ``[V - N]`` the other views.
+        sharpened: result of the stage at full size; None if there was none. Its steps are among ``steps``.
     """
 
     start: RefinedScene
@@ -54,6 +57,59 @@ class Refined:
     psnr: Tensor
     trained: Tensor
     held_out: Tensor
+    sharpened: Sharpened | None = None
+
+
+def sharpened(
+    refined: Refined,
+    photographs: Photographs,
+    seen: Observations,
+    renderer: Renderer,
+    options: RefineOptions,
+    seconds: float | None = None,
+    observe: Callable[[int, float, float], None] | None = None,
+    clock: Callable[[], float] = time.monotonic,
+) -> Refined:
+    """Continues a refinement on the photographs at their own size; arguments as for :func:`sharpen`."""
+    began = clock()
+    sharp = sharpen(refined.scene, photographs, seen, renderer, options, seconds, refined.trained.cpu(), observe, clock)
+    poses = replace(refined.scene.cameras, world_to_camera=sharp.scene.cameras.world_to_camera)
+    scene = replace(sharp.scene, cameras=poses)
+    if options.rates.cameras:
+        scene = scene.seen_from(refined.scene.cameras.world_to_camera[0, 0])
+    _, after = view_losses(scene, seen, renderer, options.loss.with_geometry(0), torch.arange(len(seen.images)))
+    return replace(
+        refined,
+        scene=scene,
+        steps=refined.steps + sharp.steps,
+        step=refined.steps + sharp.steps,
+        seconds=refined.seconds + clock() - began,
+        ended="steps" if sharp.ended in ("overfitting", "no gain") else sharp.ended,
+        psnr=torch.stack((refined.psnr[0], after)),
+        trained=trained,
+        sharpened=sharp,
+    )
+
+
+@torch.no_grad()
+def view_losses(
+    scene: RefinedScene, seen: Observations, renderer: Renderer, loss: RefineLoss, views: Tensor, unit: float = 1.0
+) -> tuple[Tensor, Tensor]:
+    """Returns loss and PSNR ``[R]`` of views ``[R]``, each rendered on its own, on the CPU."""
+    found = [view_loss(scene, seen, renderer, loss, view, unit) for view in views.to(seen.images.device).split(1)]
+    return torch.stack([each for each, _ in found]).cpu(), torch.cat([image for _, image in found]).cpu()
+
+
+def view_loss(
+    scene: RefinedScene, seen: Observations, renderer: Renderer, loss: RefineLoss, views: Tensor, unit: float
+) -> tuple[Tensor, Tensor]:
+    """Returns the loss of some views, and their PSNR ``[R]``; ``unit``: median depth of the scene."""
+    cameras, seen = scene.cameras.select(views), seen.views(views)
+    rendered = replace(renderer, geometry=loss.needs_geometry)(scene.gaussians, cameras)
+    color = where_it_counts(scene.exposed(rendered.color, views)[0], seen.images, seen.mask)
+    rendered = replace(rendered, color=color[None])
+    terms = loss.of_views(rendered, cameras, seen, unit)
+    return loss.total(terms), psnr(rendered.color[0].detach(), seen.images)
 
 
 def refine(
@@ -64,6 +120,7 @@ def refine(
     options: RefineOptions | None = None,
     observe: Callable[[int, float, float], None] | None = None,
     clock: Callable[[], float] = time.monotonic,
+    fold: Tensor | None = None,
 ) -> Refined:
     """Optimises one scene on the images of its views.
 
@@ -78,6 +135,7 @@ def refine(
         observe: called after every step with the number of steps, the share of the refinement that is done, and the
             mean PSNR of the last 20 steps in dB.
         clock: returns the time in seconds.
+        fold: ``[F]`` views that are not trained yet, because a later stage scores them (:func:`fold_of`).
 
     Raises:
         ValueError: if there are no Gaussians, or images and cameras do not match.
@@ -93,7 +151,7 @@ def refine(
     if not len(gaussians):
         raise ValueError("there are no Gaussians to refine")
     with torch.enable_grad():
-        return _Refinement(gaussians, cameras, seen, renderer, options, clock).run(observe)
+        return _Refinement(gaussians, cameras, seen, renderer, options, clock, fold).run(observe)
 
 
 class _Refinement:
@@ -105,10 +163,11 @@ class _Refinement:
         renderer: Renderer,
         options: RefineOptions,
         clock: Callable[[], float],
+        fold: Tensor | None = None,
     ) -> None:
         self.seen, self.renderer, self.clock = seen, renderer, clock
         self.began = clock()
-        self.order = ViewOrder(len(seen.images), options.holdout, options.seed)
+        self.order = ViewOrder(len(seen.images), options.holdout, options.seed, fold)
         self.trained = self.order.trained.to(seen.images.device)
         self.options = options.of(len(self.order.trained))
         loss = self.options.loss
@@ -179,7 +238,8 @@ class _Refinement:
         scene = self.parameters.scene()
         every = self.options.geometry_every
         of_step = self.options.loss.with_geometry(0 if self.steps % every else every)
-        loss, images = self._loss(scene, self.order.deal().to(self.seen.images.device), of_step)
+        view = self.order.deal().to(self.seen.images.device)
+        loss, images = view_loss(scene, self.seen, self.renderer, of_step, view, self.depth)
         if terms := of_step.of_gaussians(scene.gaussians, self.parameters.size):
             loss = loss + of_step.total(terms)
         self.recent.append(float(images.mean()))
@@ -197,20 +257,9 @@ class _Refinement:
             return ""
         return "steps" if self.steps == self.options.steps else "seconds"
 
-    def _loss(self, scene: RefinedScene, views: Tensor, loss: RefineLoss) -> tuple[Tensor, Tensor]:
-        """Returns the loss of some views, and their PSNR ``[R]``."""
-        cameras, seen = scene.cameras.select(views), self.seen.views(views)
-        rendered = replace(self.renderer, geometry=loss.needs_geometry)(scene.gaussians, cameras)
-        color = where_it_counts(scene.exposed(rendered.color, views)[0], seen.images, seen.mask)
-        rendered = replace(rendered, color=color[None])
-        terms = loss.of_views(rendered, cameras, seen, self.depth)
-        return loss.total(terms), psnr(rendered.color[0].detach(), seen.images)
-
-    @torch.no_grad()
     def _score(self, scene: RefinedScene, views: Tensor) -> tuple[Tensor, Tensor]:
         """Returns loss and PSNR ``[R]`` of views, each rendered on its own."""
-        found = [self._loss(scene, view, self.scoring) for view in views.to(self.seen.images.device).split(1)]
-        return torch.stack([loss for loss, _ in found]).cpu(), torch.cat([image for _, image in found]).cpu()
+        return view_losses(scene, self.seen, self.renderer, self.scoring, views, self.depth)
 
     def _check(self) -> str:
         """Scores the current state and keeps it if it is the best; returns what is wrong if it diverges."""
@@ -235,6 +284,13 @@ class _Refinement:
         return "diverged"
 
 
+def split_views(views: int, holdout: int | None) -> tuple[Tensor, Tensor]:
+    """Returns the indices of the views to train on, and of every N-th one, which is not; None: train on all."""
+    every = torch.arange(views)
+    last = torch.zeros(views, dtype=torch.bool) if holdout is None else every % holdout == holdout - 1
+    return every[~last], every[last]
+
+
 class ViewOrder:
     """Deals views in random order, each once before any repeats; some are left out, in rotation.
 
@@ -242,16 +298,17 @@ class ViewOrder:
         views: number of views.
         holdout: never deal every N-th view; None: deal all.
         seed: random seed of the order.
+        fold: further views that are not dealt; None: none.
 
     Attributes:
         trained: ``[N]`` views that are dealt.
-        held_out: ``[V - N]`` views that are never dealt.
+        held_out: ``[V - N]`` views that are never dealt, without the fold.
     """
 
-    def __init__(self, views: int, holdout: int | None, seed: int) -> None:
-        every = torch.arange(views)
-        last = torch.zeros(views, dtype=torch.bool) if holdout is None else every % holdout == holdout - 1
-        self.trained, self.held_out = every[~last], every[last]
+    def __init__(self, views: int, holdout: int | None, seed: int, fold: Tensor | None = None) -> None:
+        self.trained, self.held_out = split_views(views, holdout)
+        if fold is not None:
+            self.trained = self.trained[~torch.isin(self.trained, fold)]
         self._generator = torch.Generator().manual_seed(seed)
         self._left_out = self._rotation()
         self._hand: list[int] = []

@@ -1,0 +1,120 @@
+"""Photographs of a scene's views at their own size, dealt in crops."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from vg2gt.refinement.options import Observations
+from vg2gt.types import Cameras, TensorRecord
+
+
+@dataclass(frozen=True)
+class Photographs(TensorRecord):
+    """Photographs of V views at their own size.
+
+    Attributes:
+        images: ``[V, 3, H, W]`` uint8.
+        intrinsics: ``[V, 3, 3]`` at this size.
+        mask: ``[V, H, W]`` uint8 pixel weights, 255: full; None: all pixels count.
+    """
+
+    images: Tensor
+    intrinsics: Tensor
+    mask: Tensor | None = None
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width in pixels."""
+        return (self.images.shape[-2], self.images.shape[-1])
+
+    def cameras(self, poses: Cameras) -> Cameras:
+        """Returns the cameras of the photographs, with the poses of ``poses`` (B = 1)."""
+        return Cameras(poses.world_to_camera, self.intrinsics[None], self.size)
+
+
+@dataclass(frozen=True)
+class Crop:
+    """A part of one photograph.
+
+    Attributes:
+        view: index of the photograph.
+        top: first row.
+        left: first column.
+        size: height and width in pixels.
+    """
+
+    view: int
+    top: int
+    left: int
+    size: tuple[int, int]
+
+    def camera(self, cameras: Cameras) -> Cameras:
+        """Returns the crop's camera from those of the photographs: the principal point moves."""
+        one = slice(self.view, self.view + 1)
+        corner = cameras.intrinsics.new_zeros(3, 3)
+        corner[0, 2], corner[1, 2] = self.left, self.top
+        return Cameras(cameras.world_to_camera[:, one], cameras.intrinsics[:, one] - corner, self.size)
+
+    def observations(self, photographs: Photographs, seen: Observations, intrinsics: Tensor) -> Observations:
+        """Returns what is known of the crop's pixels.
+
+        Args:
+            photographs: the photographs.
+            seen: observations of the views at the working size; depth comes from their nearest pixel.
+            intrinsics: ``[V, 3, 3]`` of the views at the working size.
+        """
+        one = slice(self.view, self.view + 1)
+        window = (slice(self.top, self.top + self.size[0]), slice(self.left, self.left + self.size[1]))
+        images = photographs.images[(one, slice(None), *window)].to(seen.images.dtype) / 255
+        mask = None if photographs.mask is None else photographs.mask[(one, *window)].to(images.dtype) / 255
+        known = []
+        for axis, (first, side) in enumerate(((self.left, self.size[1]), (self.top, self.size[0]))):
+            pixels = torch.arange(first, first + side, device=images.device)
+            matrix, small = photographs.intrinsics[self.view], intrinsics[self.view]
+            tangent = (pixels - matrix[axis, 2]) / matrix[axis, axis]
+            known.append((tangent * small[axis, axis] + small[axis, 2]).round().long())
+        columns, rows = known
+        height, width = seen.depth.shape[-2:]
+        inside = ((rows >= 0) & (rows < height))[:, None] & ((columns >= 0) & (columns < width))
+        grid = (self.view, rows.clamp(0, height - 1)[:, None], columns.clamp(0, width - 1))
+        depth = torch.where(inside, seen.depth[grid], 0.0)[None]
+        return Observations(images, depth, seen.depth_conf[grid][None], mask)
+
+
+class CropOrder:
+    """Deals crops of random views: each view once before any repeats, each pixel of a view about equally often.
+
+    Args:
+        size: height and width of the photographs.
+        side: longest side of a crop in pixels.
+        views: ``[N]`` views to deal.
+        seed: random seed.
+    """
+
+    def __init__(self, size: tuple[int, int], side: int, views: Tensor, seed: int) -> None:
+        self.size, self.views = size, views
+        self.crop = (min(side, size[0]), min(side, size[1]))
+        self._generator = torch.Generator().manual_seed(seed)
+        self._hand: list[int] = []
+
+    def deal(self) -> Crop:
+        """Returns the next crop."""
+        if not self._hand:
+            order = torch.randperm(len(self.views), generator=self._generator)
+            self._hand = self.views[order].tolist()
+        top, left = (self._start(whole, part) for whole, part in zip(self.size, self.crop, strict=True))
+        return Crop(self._hand.pop(), top, left, self.crop)
+
+    def _start(self, whole: int, part: int) -> int:
+        """Returns the first pixel of a crop along one axis; positions beyond the border are moved to it."""
+        room = whole - part
+        drawn = float(torch.rand((), generator=self._generator)) * (room + part) - part / 2
+        return min(max(round(drawn), 0), room)
+
+
+def whole_views(photographs: Photographs, views: Tensor) -> list[Crop]:
+    """Returns the crops that are whole photographs."""
+    return [Crop(view, 0, 0, photographs.size) for view in views.tolist()]

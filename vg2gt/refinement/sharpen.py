@@ -1,0 +1,241 @@
+"""Second stage of a refinement: the photographs at their own size, crop by crop, with Gaussians that split."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from vg2gt.losses.gaussian import where_it_counts
+from vg2gt.metrics import psnr
+from vg2gt.refinement.growth import in_front, remove_idle, split_large
+from vg2gt.refinement.options import FullSizeOptions, Observations, RefineLoss, RefineOptions
+from vg2gt.refinement.parameters import Parameters, RefinedScene
+from vg2gt.refinement.photographs import Crop, CropOrder, Photographs, whole_views
+from vg2gt.rendering import Renderer
+
+log = logging.getLogger(__name__)
+
+FINAL_RATE = 0.1  # factor to which rates decay exponentially
+FEWEST = 6  # with fewer views, none is left out
+SCORED = 3  # maximum number of left-out views
+CHECKS = 12  # number of times that left-out views are scored
+PATIENCE = 2  # checks below the best one after which the stage ends
+NOTICED = 0.05  # dB
+
+
+@dataclass(frozen=True)
+class Sharpened:
+    """Result of the second stage.
+
+    Attributes:
+        scene: the scene; its cameras have the photographs' size.
+        steps: number of steps.
+        ended: ``steps``, ``seconds``, ``interrupted``, ``diverged``, ``overfitting`` (left-out views became worse, and
+            the stage ended early) or ``no gain`` (it made them worse from the start, and ``scene`` is the start).
+        fold: left-out views.
+        scores: PSNR of the left-out views in dB, before and while they were left out.
+        growth: number of Gaussians that were split.
+    """
+
+    scene: RefinedScene
+    steps: int
+    ended: str
+    fold: tuple[int, ...]
+    scores: tuple[float, ...]
+    growth: int
+
+
+def sharpen(
+    start: RefinedScene,
+    photographs: Photographs,
+    seen: Observations,
+    renderer: Renderer,
+    options: RefineOptions,
+    seconds: float | None = None,
+    trained: Tensor | None = None,
+    observe: Callable[[int, float, float], None] | None = None,
+    clock: Callable[[], float] = time.monotonic,
+) -> Sharpened:
+    """Optimises a refined scene on crops of its photographs.
+
+    Ctrl-C ends it and returns the state reached.
+
+    Args:
+        start: the scene, with cameras at the working size.
+        photographs: photographs of its V views.
+        seen: observations of the views at the working size, for the terms of depth and normals.
+        renderer: renderer of the scene.
+        options: options; ``options.full`` must not be None.
+        seconds: maximum time; None: until ``options.full.steps`` are made.
+        trained: ``[N]`` views to train on; None: all.
+        observe: called after every step with the number of steps, the share of the stage that is done, and the mean
+            PSNR of the last 20 steps in dB.
+        clock: returns the time in seconds.
+    """
+    if trained is None:
+        trained = torch.arange(len(photographs.images))
+    with torch.enable_grad():
+        return _Sharpening(start, photographs, seen, renderer, options, seconds, trained, clock).run(observe)
+
+
+class _Sharpening:
+    def __init__(
+        self,
+        start: RefinedScene,
+        photographs: Photographs,
+        seen: Observations,
+        renderer: Renderer,
+        options: RefineOptions,
+        seconds: float | None,
+        trained: Tensor,
+        clock: Callable[[], float],
+    ) -> None:
+        assert options.full is not None
+        self.options, self.full, self.loss = options, options.full, options.loss
+        self.photographs, self.seen, self.renderer = photographs, seen, renderer
+        self.intrinsics = start.cameras.intrinsics[0]
+        self.start = replace(start, cameras=photographs.cameras(start.cameras)).detach()
+        self.clock, self.began, self.seconds = clock, clock(), seconds
+        self.views = trained
+        self.fold = fold_of(trained, self.full)
+        visible = seen.depth[seen.depth > 0]
+        self.depth = float(visible.median()) if len(visible) else 1.0
+        focal = float(photographs.intrinsics[:, [0, 1], [0, 1]].mean())
+        rates = options.rates
+        rates = replace(rates, means=self.full.rate * rates.means, sh=self.full.rate * rates.sh)
+        self.parameters = Parameters(self.start, rates, 1 / focal, self.depth, trained)
+        self.limit = _most_steps(self.full, photographs, len(trained), seconds)
+        self.open = not len(self.fold)
+        self.order = self._order()
+        self.stretch = 1.0  # of the stage that is left to run
+        self.steps = self.growth = 0
+        self.recent: list[float] = []
+        self.scores: list[float] = []
+
+    def run(self, observe: Callable[[int, float, float], None] | None) -> Sharpened:
+        """Runs steps, growth and checks until the stage ends."""
+        ended = ""
+        self._grow(twice=True)
+        if not self.open:
+            self.scores.append(self._score())
+        try:
+            while not ended:
+                ended = self._step()
+                if observe is not None:
+                    observe(self.steps, self._done(), sum(self.recent) / len(self.recent))
+        except KeyboardInterrupt:
+            ended = "interrupted"
+        scene = self.start if ended == "no gain" else self.parameters.scene().detach()
+        return Sharpened(
+            scene=scene,
+            steps=self.steps,
+            ended=ended,
+            fold=tuple(self.fold.tolist()),
+            scores=tuple(self.scores),
+            growth=self.growth,
+        )
+
+    def _raw(self) -> float:
+        """Share of the planned steps or seconds that has passed."""
+        spent = 0.0 if self.seconds is None else (self.clock() - self.began) / self.seconds
+        return max(self.steps / self.limit, spent)
+
+    def _done(self) -> float:
+        return min(1.0, self._raw() / self.stretch)
+
+    def _order(self) -> CropOrder:
+        views = self.views if self.open else self.views[~torch.isin(self.views, self.fold)]
+        return CropOrder(self.photographs.size, self.full.crop, views, self.options.seed)
+
+    def _step(self) -> str:
+        """Runs one step and what is due after it; returns how the stage ended, or an empty string."""
+        every = self.options.geometry_every
+        of_step = self.loss.with_geometry(0 if self.steps % every else every)
+        crop = self.order.deal()
+        rows = self._rows(crop)
+        scene = self.parameters.scene(rows)
+        rendered, image = self._terms(scene, crop, of_step)
+        if terms := of_step.of_gaussians(scene.gaussians, self.parameters.size[rows]):
+            rendered = rendered + of_step.total(terms)
+        self.recent = [*self.recent, image][-20:]
+        self.steps += 1
+        if not self.parameters.step(rendered, FINAL_RATE ** self._done()):
+            log.warning("refinement at full size, step %d: the loss or its gradient is not finite", self.steps)
+            return "diverged"
+        done = self._done()
+        if done >= 1:
+            return "overfitting" if self.stretch < 1 else "steps" if self.steps >= self.limit else "seconds"
+        if self.steps % self.full.grow_every == 0:
+            self.parameters.prune()
+            if done < self.full.grow_until:
+                self._grow()
+        return "" if self.open else self._watch(done)
+
+    def _rows(self, crop: Crop) -> Tensor:
+        """Returns the Gaussians that a crop may show."""
+        values = self.parameters.values
+        size = values["scales"].max(-1).values.exp()
+        return in_front(size, values["means"], crop.camera(self.start.cameras), self.renderer.near)
+
+    def _terms(self, scene: RefinedScene, crop: Crop, loss: RefineLoss) -> tuple[Tensor, float]:
+        """Returns the loss of one crop, and its PSNR in dB."""
+        camera = crop.camera(scene.cameras)
+        seen = crop.observations(self.photographs, self.seen, self.intrinsics)
+        view = torch.tensor([crop.view], device=seen.images.device)
+        rendered = replace(self.renderer, geometry=loss.needs_geometry)(scene.gaussians, camera)
+        color = where_it_counts(scene.exposed(rendered.color, view)[0], seen.images, seen.mask)
+        terms = loss.of_views(replace(rendered, color=color[None]), camera, seen, self.depth)
+        return loss.total(terms), float(psnr(color.detach(), seen.images).mean())
+
+    def _grow(self, twice: bool = False) -> None:
+        cameras = self.start.cameras
+        remove_idle(self.parameters, cameras, self.renderer, self.full.least)
+        for factor in (1.5, 1.5) if twice else (1.0,):
+            pixels = factor * self.full.footprint
+            self.growth += split_large(self.parameters, cameras, self.renderer.near, pixels, self.full.max_gaussians)
+
+    @torch.no_grad()
+    def _score(self) -> float:
+        """Returns the mean PSNR of the left-out views in dB."""
+        plain, scene = self.loss.with_geometry(0), self.parameters.scene()
+        crops = whole_views(self.photographs, self.fold)
+        return sum(self._terms(scene, crop, plain)[1] for crop in crops) / len(crops)
+
+    def _watch(self, done: float) -> str:
+        """Scores the left-out views if it is time; trains all views once these are worse, or late in the stage."""
+        due = len(self.scores) * self.full.opened / CHECKS
+        if done >= due:
+            self.scores.append(self._score())
+        best = max(self.scores)
+        worse = len(self.scores) > PATIENCE and max(self.scores[-PATIENCE:]) < best - NOTICED
+        if worse and best == self.scores[0]:
+            return "no gain"
+        if worse:
+            self.stretch = self._raw() / self.full.opened
+        if worse or done >= self.full.opened:
+            self.open = True
+            self.order = self._order()
+        return ""
+
+
+def fold_of(views: Tensor, options: FullSizeOptions) -> Tensor:
+    """Returns the views of ``views [N]`` that are left out at first: one of several, but no more than three."""
+    if not options.fold or len(views) < FEWEST:
+        return views[:0]
+    count = min(SCORED, max(1, len(views) // options.fold))
+    places = (torch.arange(count, dtype=torch.float64) + 0.5) * len(views) / count
+    return views[places.long()]
+
+
+def _most_steps(options: FullSizeOptions, photographs: Photographs, views: int, seconds: float | None) -> int:
+    """Returns the number of steps: what each pixel's renderings allow and, without ``seconds``, the options' own."""
+    height, width = photographs.size
+    share = min(1.0, options.crop / height) * min(1.0, options.crop / width)
+    most = max(1, math.ceil(options.renderings * views / share))
+    return most if seconds is not None else min(options.steps, most)
