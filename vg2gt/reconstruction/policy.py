@@ -1,0 +1,67 @@
+"""How a scene is refined by default: one policy for the command and Python."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Literal
+
+from hydra.utils import instantiate
+
+from vg2gt.config import compose_groups
+from vg2gt.reconstruction.windows.store import AUTOMATIC
+from vg2gt.refinement import RefineOptions, RefineRates
+from vg2gt.types import check_choice
+
+if TYPE_CHECKING:
+    from vg2gt.reconstruction.scene import Scene
+
+Quality = Literal["draft", "normal", "high"]
+RECORDINGS = ("RGBDFolder", "TUM")  # their measured poses fit their depth better than bundle adjustment does
+WITHOUT_PHOTOGRAPHS = 400  # steps at the working size, where there is no stage at full size
+
+
+def is_recording(scene: Scene) -> bool:
+    """Returns whether a scene comes from a recording with measured depth and poses."""
+    return scene.cameras_from.startswith(RECORDINGS)
+
+
+def refined_by_default(scene: Scene) -> bool:
+    """Returns whether ``vg2gt reconstruct`` refines a scene without being told: up to 100 photographs."""
+    return not is_recording(scene) and len(scene.names) <= AUTOMATIC
+
+
+def refinement_for(
+    scene: Scene, quality: Quality = "normal", overrides: Sequence[str] = (), **changes: float | None
+) -> RefineOptions:
+    """Returns the options of a scene's refinement.
+
+    Args:
+        scene: the scene. Recordings are refined by ``configs/refine/default.yaml``, all others by
+            ``photographs.yaml``, ``draft.yaml`` or ``high.yaml``, according to ``quality``.
+        quality: ``draft`` stays at the working size; ``high`` takes about five times as long as ``normal``.
+        overrides: Hydra overrides: ``refine=NAME`` and ``refine.key=value``.
+        **changes: options that are set after the overrides unless they are None, such as ``seconds``, which alone
+            replaces the default number of steps.
+
+    Raises:
+        ValueError: if an override or the quality is unknown.
+    """
+    check_choice("quality", quality, Quality)
+    name = "default" if is_recording(scene) else {"normal": "photographs"}.get(quality, quality)
+    found = read_options(name, overrides)
+    given: dict[str, Any] = {key: value for key, value in changes.items() if value is not None}
+    if not overrides and not scene.cameras_from:
+        found = replace(found, rates=replace(found.rates, cameras=RefineRates().cameras))
+    if found.full is not None and not scene.pictures:
+        steps = found.steps if any(each.startswith("refine.steps=") for each in overrides) else WITHOUT_PHOTOGRAPHS
+        found = replace(found, full=None, steps=steps)
+    if "seconds" in given and found.full is None:
+        given = {"steps": None, **given}
+    return replace(found, **given)
+
+
+def read_options(name: str, overrides: Sequence[str]) -> RefineOptions:
+    """Builds the options of ``refine=NAME refine.key=value``; ``name`` is used if the overrides choose none."""
+    chosen = any(override.startswith("refine=") for override in overrides)
+    return instantiate(compose_groups(*([] if chosen else [f"refine={name}"]), *overrides).refine)
