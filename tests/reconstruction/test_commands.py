@@ -20,11 +20,10 @@ from vg2gt.reconstruction.scene import Scene
 TINY = ["backend=da3_tiny", "--size", "70", "--quiet", "--device", "cpu"]
 
 
-def test_photographs_of_all_sizes(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch) -> None:
-    """Refined by default; 20 of the 400 steps do here."""
-    by_default = reconstruct_command._refinement
-    monkeypatch.setattr(reconstruct_command, "_refinement", lambda *given: replace(by_default(*given), steps=20))
-    reconstruct_command.main([str(photos), "--out", str(tmp_path / "out"), *TINY])
+def test_photographs_of_all_sizes(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """Refined by default, at the working size and then at the photographs' own."""
+    fewer = ["refine.steps=20", "refine.full.steps=10", "refine.full.crop=64", "refine.full.size=140"]
+    reconstruct_command.main([str(photos), "--out", str(tmp_path / "out"), *TINY, *fewer])
     names = {"scene.ply", "cameras.json", "views.npz", "report.png", "report.json"}
     assert {p.name for p in (tmp_path / "out").iterdir()} == names
     figures = json.loads((tmp_path / "out" / "report.json").read_text())
@@ -35,9 +34,9 @@ def test_photographs_of_all_sizes(photos: Path, tmp_path: Path, capsys: pytest.C
     printed = capsys.readouterr().out
     assert "4 images of 56x70" in printed
     assert "untrained" in printed
-    assert "refining for 400 steps" in printed
     assert "peak memory" in printed
-    assert figures["refinement"]["steps"] == 20
+    assert figures["refinement"]["steps"] == 30
+    assert figures["refinement"]["full_size"]["image"] == [112, 140]
 
 
 def test_written_scene_renders_to_the_image_in_memory(scene: Scene, tmp_path: Path) -> None:

@@ -11,9 +11,15 @@ import pytest
 import torch
 
 from vg2gt.cli import main
-from vg2gt.cli.reconstruct import _refinement
+from vg2gt.data.transforms import resize_images
+from vg2gt.geometry.cameras import resize_intrinsics
+from vg2gt.inputs.inputs import load_views
+from vg2gt.inputs.pictures import find_pictures
 from vg2gt.io import read_cameras_json, read_gaussian_ply, write_cameras_json
+from vg2gt.monitor import Monitor
 from vg2gt.outputs.saved import near_of, read_scene
+from vg2gt.reconstruction.photographs import full_size, load_photographs
+from vg2gt.reconstruction.policy import refined_by_default, refinement_for
 from vg2gt.reconstruction.scene import Scene
 from vg2gt.refinement import RefineOptions, RefineRates
 from vg2gt.rendering import Renderer
@@ -54,16 +60,39 @@ def test_the_command(saved: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytes
 
 
 def test_photographs_are_refined_unless_asked_not_to(scene: Scene) -> None:
-    """Cameras from bundle adjustment stay, predicted ones move; recordings are refined on demand, as before."""
+    """Cameras from bundle adjustment stay, predicted ones move; recordings are refined on demand."""
     photographs = replace(scene, cameras_from="structure from motion, 4 of 4 images")
-    by_default = _refinement(photographs, None)
-    assert (by_default.steps, by_default.rates.cameras, by_default.min_views) == (400, 0.0, 3)
-    assert _refinement(photographs, 0) is None
-    predicted = _refinement(replace(scene, cameras_from=""), 7)
+    assert refined_by_default(photographs)
+    normal = refinement_for(photographs)
+    assert (normal.steps, normal.rates.cameras, normal.min_views) == (400, 0.0, 3)
+    assert refinement_for(photographs, "draft").full is None
+    normal_full, high_full = normal.full, refinement_for(photographs, "high").full
+    assert high_full.steps > 3 * normal_full.steps
+    assert refinement_for(photographs, overrides=["refine.full.crop=64"]).full.crop == 64
+    assert refinement_for(replace(photographs, pictures=()), "draft").steps == 400  # no photographs to go on with
+    predicted = refinement_for(replace(scene, cameras_from=""), steps=7)
     assert (predicted.steps, predicted.rates.cameras) == (7, RefineRates().cameras)
     recording = replace(scene, cameras_from="RGBDFolder somewhere")
-    assert _refinement(recording, None) is None
-    assert _refinement(recording, 7) == RefineOptions(steps=7)
+    assert not refined_by_default(recording)
+    assert refinement_for(recording, steps=7) == RefineOptions(steps=7)
+    with pytest.raises(ValueError, match="quality must be one of"):
+        refinement_for(photographs, "best")  # pyright: ignore[reportArgumentType]
+
+
+def test_photographs_at_their_own_size_are_those_of_the_views(photos: Path, scene: Scene) -> None:
+    """Larger, lying on their side and cropped ones fit their views, pixels and cameras."""
+    pictures = find_pictures(photos)
+    height, width = scene.cameras.size
+    views = load_views(pictures, (height, width), Monitor())
+    cameras = scene.cameras.select(torch.arange(len(pictures)))
+    found = load_photographs(pictures, cameras, 3 * width, Monitor())
+    assert found.size == full_size(pictures, (height, width), 3 * width)
+    factor = found.size[0] / height
+    assert factor > 1
+    back = resize_images(found.images / 255, (height, width))
+    assert (back - views.images).abs().mean() < 0.02
+    moved = resize_intrinsics(cameras.intrinsics[0], factor, factor)
+    torch.testing.assert_close(found.intrinsics, moved, atol=0.6, rtol=0)
 
 
 def test_the_near_plane_is_that_of_the_scene(saved, tmp_path) -> None:

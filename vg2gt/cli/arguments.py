@@ -21,7 +21,7 @@ from vg2gt.config import config_dir
 folders.register()
 
 OVERRIDE = re.compile(r"(\+\+?|~)?[A-Za-z_][\w./]*=")
-OVERRIDES = "\nmodel, backend and renderer are chosen by key=value: backend=da3_small model.fine.max_voxels=500000"
+OVERRIDES = "\nmodel, backend, renderer and refinement are set by key=value: backend=da3_small refine.full.size=1008"
 
 
 def hydra_command(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 
 from vg2gt.cli.arguments import OVERRIDES, add_common_flags, flag_parser, list_of_names, listing, separate
 from vg2gt.cli.errors import errors_in_one_line
-from vg2gt.cli.refine import options_for
 from vg2gt.outputs.output_names import DEFAULT, LARGE, OUTPUTS, PREDICTED, SFM, TILES
 from vg2gt.reconstruction.windows import WINDOWS
 
@@ -25,7 +24,12 @@ WINDOW = (
     "than 100 images (kept in DIR/windows until the end, so that an interrupted command can resume)"
 )
 
-REFINE = "steps of refinement on the images; default: 400 for photographs, 0 for RGB-D recordings; 0: feed-forward"
+QUALITY = (
+    "how long to refine photographs: draft stays at the working size, normal and high continue at the photographs' own "
+    "size (normal takes two to three minutes for 24 photographs on two cores, high about five times as long)"
+)
+
+REFINE = "refine for N steps at the working size only, recordings too; 0: feed-forward"
 
 if TYPE_CHECKING:
     from vg2gt.monitor import Monitor
@@ -50,6 +54,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     add("--max-images", type=int, metavar="N", help="use at most N, evenly spaced; default: all, 32 of a video")
     add("--window", type=int, metavar="N", help=WINDOW)
     add("--keep-windows", action="store_true", help="keep what --add and --take-out need in DIR/windows")
+    add("--quality", choices=("draft", "normal", "high"), default="normal", help=QUALITY)
     add("--refine", type=int, metavar="N", help=REFINE)
     add("--mesh-voxel", type=float, metavar="X", help="edge of the mesh's voxels in scene units")
     add("--calibration", metavar="FILE", help="calibration file of the error bounds; default: next to the checkpoint")
@@ -69,6 +74,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     from vg2gt.memory import RECONSTRUCTION, memory_advice
     from vg2gt.monitor import Monitor
     from vg2gt.outputs.outputs import cost_figures, write_outputs
+    from vg2gt.reconstruction.policy import read_options
     from vg2gt.reconstruction.refined import refine_scene, refinement_lines
     from vg2gt.reconstruction.trust import trust_line, trusted
     from vg2gt.reconstruction.windows.store import remove, tidy
@@ -77,12 +83,15 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     changed = options.add or options.take_out
     options.out = str(Path(changed or options.out).expanduser())
     options.overwrite |= changed is not None
+    how_to_refine = [each for each in overrides if each.startswith(("refine=", "refine."))]
+    overrides = [each for each in overrides if each not in how_to_refine]
     _check(options, overrides)
+    read_options("default", how_to_refine)  # reports wrong options before any work
     with Monitor(show=not options.quiet, device=choose_device(options.device)) as monitor:
         with monitor.stage("load model"):
             ready = load_model(options.ckpt, overrides=overrides, device=options.device)
         scene = _scene(options, ready, monitor)
-        how = _refinement(scene, options.refine)
+        how = _refinement(scene, options, how_to_refine)
         if how is not None:
             scene = refine_scene(scene, how, monitor)
         scene = trusted(scene, options.min_confidence, options.drop)
@@ -171,18 +180,15 @@ def _scene(options: argparse.Namespace, ready: LoadedModel, monitor: Monitor) ->
     )
 
 
-def _refinement(scene: Scene, steps: int | None) -> RefineOptions | None:
-    """Refinement options; None without refinement: ``steps`` is 0, or not given for recordings and long captures."""
-    from vg2gt.reconstruction.refined import refinement_of
-    from vg2gt.reconstruction.windows.store import AUTOMATIC
+def _refinement(scene: Scene, options: argparse.Namespace, overrides: Sequence[str]) -> RefineOptions | None:
+    """Refinement options; None without refinement: it is switched off, or a recording or long capture without any."""
+    from vg2gt.reconstruction.policy import refined_by_default, refinement_for
 
-    many = len(scene.names) > AUTOMATIC  # refinement holds all images in memory
-    if steps == 0 or (steps is None and (many or refinement_of(scene) == "default")):
+    wanted = options.refine is not None or bool(overrides)
+    if options.refine == 0 or not (wanted or refined_by_default(scene)):
         return None
-    how = options_for(scene, steps=steps)
-    if steps is None:
-        print(f"refining for {how.steps} steps, up to a minute on two cores; --refine 0 gives the feed-forward scene")
-    return how
+    how = refinement_for(scene, options.quality, overrides, steps=options.refine)
+    return how if options.refine is None else replace(how, full=None)
 
 
 def _size(text: str) -> int | tuple[int, int]:

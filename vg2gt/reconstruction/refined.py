@@ -10,20 +10,14 @@ from typing import TYPE_CHECKING, Any
 from vg2gt.monitor import Monitor
 from vg2gt.reconstruction.photographs import load_photographs
 from vg2gt.reconstruction.surroundings import without_debris
-from vg2gt.refinement import Observations, RefineOptions, fold_of, refine, sharpened, split_views
+from vg2gt.refinement import Observations, RefineOptions, exposure_rates, fold_of, refine, sharpened, split_views
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from vg2gt.reconstruction.scene import Scene
 
-WORKING_SHARE = 0.3  # of the time, at most, for the stage at the working size
-RECORDINGS = ("RGBDFolder", "TUM")  # their measured poses fit their depth better than bundle adjustment does
-
-
-def refinement_of(scene: Scene) -> str:
-    """Returns the configuration in ``configs/refine`` for a scene: ``default`` for RGB-D, else ``photographs``."""
-    return "default" if scene.cameras_from.startswith(RECORDINGS) else "photographs"
+WORKING_SHARE = 0.45  # of the time, at most, for the stage at the working size
 
 
 def refine_scene(
@@ -46,6 +40,8 @@ def refine_scene(
     monitor, began = monitor or Monitor(), clock()
     device = scene.gaussians.means.device
     seen = Observations(scene.images, scene.depth, scene.depth_conf, scene.mask).to(device)
+    rates = exposure_rates(options.rates, scene.gaussians, scene.cameras, seen, scene.renderer)
+    options = replace(options, rates=rates)
     full = options.full if scene.pictures else None
     at_working_size = options
     if full is not None and options.seconds is not None:

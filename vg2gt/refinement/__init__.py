@@ -1,5 +1,6 @@
 """Per-scene optimisation of a feed-forward scene: sharper colour, with geometry held in place."""
 
+from vg2gt.refinement.exposure import exposure_rates
 from vg2gt.refinement.options import FullSizeOptions, Observations, RefineLoss, RefineOptions, RefineRates
 from vg2gt.refinement.parameters import RefinedScene
 from vg2gt.refinement.photographs import Photographs
@@ -16,6 +17,7 @@ __all__ = [
     "Refined",
     "RefinedScene",
     "Sharpened",
+    "exposure_rates",
     "fold_of",
     "refine",
     "sharpen",

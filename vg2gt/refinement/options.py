@@ -125,7 +125,7 @@ class RefineLoss:
 
 def _not_negative(options: RefineLoss | RefineRates, name: str) -> None:
     for key, value in asdict(options).items():
-        if not value >= 0:
+        if value is not None and not value >= 0:
             raise ValueError(f"refine.{name}.{key} must be at least 0, got {value}")
 
 
@@ -141,7 +141,8 @@ class RefineRates:
         sh: of the constant colour coefficient; the higher bands have a twentieth of it (as in 3DGS).
         cameras: of rotations and shifts, in pixels: a rotation by one pixel, or a shift that moves points at the median
             depth by one pixel.
-        exposure: of each view's log gain and bias, one per colour channel.
+        exposure: of each view's log gain and bias, one per colour channel. None: 0.004 if the views were exposed
+            differently (:mod:`vg2gt.refinement.exposure`), else 0.
 
     Raises:
         ValueError: if a rate is negative.
@@ -153,7 +154,7 @@ class RefineRates:
     opacities: float = 0.05
     sh: float = 0.02
     cameras: float = 0.03
-    exposure: float = 0.0
+    exposure: float | None = 0.0
 
     def __post_init__(self) -> None:
         _not_negative(self, "rates")
@@ -171,6 +172,8 @@ class FullSizeOptions:
         steps: maximum number of steps, if the refinement has no maximum time.
         renderings: maximum number of times that each pixel of the photographs is rendered: more would overfit.
         crop: longest side of a crop in pixels.
+        coarse: share of the stage, at its start, on photographs of half the size, of which a crop shows four times as
+            much; only if they are much larger than the working size.
         rate: factor on the rates of positions and colours.
         max_gaussians: no Gaussian is split if there would be more.
         footprint: standard deviation in pixels above which a Gaussian is split.
@@ -179,6 +182,7 @@ class FullSizeOptions:
         grow_until: share of the stage after which no Gaussian is split.
         fold: leave out one view of this many at first; 0: none. Fewer than six views are never left out.
         opened: share of the stage after which all views are trained.
+        geometry_every: as in :class:`RefineOptions`.
 
     Raises:
         ValueError: if an option is out of range.
@@ -188,14 +192,16 @@ class FullSizeOptions:
     steps: int = 1500
     renderings: float = 40.0
     crop: int = 320
+    coarse: float = 0.3
     rate: float = 0.5
     max_gaussians: int = 400_000
     footprint: float = 3.0
     least: float = 0.3
     grow_every: int = 150
     grow_until: float = 0.6
-    fold: int = 8
+    fold: int = 16
     opened: float = 0.7
+    geometry_every: int = 8
 
     def __post_init__(self) -> None:
         for name, good, expected in (
@@ -203,6 +209,7 @@ class FullSizeOptions:
             ("steps", self.steps >= 1, "at least 1"),
             ("renderings", self.renderings > 0, "positive"),
             ("crop", self.crop >= MIN_CROP, f"at least {MIN_CROP}"),
+            ("coarse", 0 <= self.coarse < 1, "in [0, 1)"),
             ("rate", self.rate > 0, "positive"),
             ("max_gaussians", self.max_gaussians >= 1, "at least 1"),
             ("footprint", self.footprint > 0, "positive"),
@@ -211,6 +218,7 @@ class FullSizeOptions:
             ("grow_until", 0 <= self.grow_until <= 1, "in [0, 1]"),
             ("fold", self.fold == 0 or self.fold >= 2, "0 or at least 2"),
             ("opened", 0 < self.opened < 1, "between 0 and 1"),
+            ("geometry_every", self.geometry_every >= 1, "at least 1"),
         ):
             if not good:
                 raise ValueError(f"refine.full.{name} must be {expected}, got {getattr(self, name)}")

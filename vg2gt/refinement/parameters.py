@@ -58,10 +58,10 @@ class Parameters:
     """Unconstrained parameters of a scene, with Adam's moments.
 
     A step may concern some Gaussians only, such as those in front of a crop: the others keep values and moments, which
-    saves most of a step's time. Positions move in units of each Gaussian's middle standard deviation at the start, so
-    that one rate fits small and large Gaussians and every scene's unit. Cameras rotate and shift in their own frames.
-    View 0 is optimised too: otherwise an error of its pose would have to be compensated by all other views and
-    Gaussians (:meth:`RefinedScene.seen_from` restores its pose).
+    saves most of a step's time. Positions move in units of each Gaussian's middle standard deviation, measured at the
+    start and after splits, so that one rate fits small and large Gaussians and every scene's unit. Cameras rotate and
+    shift in their own frames. View 0 is optimised too: otherwise an error of its pose would have to be compensated by
+    all other views and Gaussians (:meth:`RefinedScene.seen_from` restores its pose).
 
     Args:
         start: initial state.
@@ -95,7 +95,8 @@ class Parameters:
             "gain": start.gain.log(),
             "bias": start.bias.clone(),
         }
-        self.rates = {**vars(rates), "sh_rest": HIGHER_BANDS * rates.sh, "gain": rates.exposure, "bias": rates.exposure}
+        exposure = rates.exposure or 0.0
+        self.rates = {**vars(rates), "sh_rest": HIGHER_BANDS * rates.sh, "gain": exposure, "bias": exposure}
         self.moments = {name: (torch.zeros_like(value), torch.zeros_like(value)) for name, value in self.values.items()}
         self.counts = torch.zeros_like(self.unit)
         self.steps = 0
@@ -209,6 +210,15 @@ class Parameters:
         self.values["means"][rows] += shift
         self._replace(lambda values: torch.cat((values, values[rows])))
         self.values["means"][-len(rows) :] -= 2 * shift
+        self._measure()
+
+    def _measure(self) -> None:
+        """Sets the unit of positions to the present sizes; the moments of positions are in this unit, too."""
+        unit = self.values["scales"].median(-1).values.exp()
+        ratio = (unit / self.unit)[:, None]
+        self.unit = unit
+        first, second = self.moments["means"]
+        self.moments["means"] = (first * ratio, second * ratio.square())
 
     def _replace(self, change: Callable[[Tensor], Tensor]) -> None:
         """Applies a change of rows to all that is known of the Gaussians."""

@@ -6,7 +6,9 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
+from vg2gt.geometry.cameras import resize_intrinsics
 from vg2gt.refinement.options import Observations
 from vg2gt.types import Cameras, TensorRecord
 
@@ -29,6 +31,15 @@ class Photographs(TensorRecord):
     def size(self) -> tuple[int, int]:
         """Height and width in pixels."""
         return (self.images.shape[-2], self.images.shape[-1])
+
+    def halved(self) -> Photographs:
+        """Returns the photographs at half the size, each pixel the mean of four; an odd last row or column is lost."""
+
+        def half(images: Tensor) -> Tensor:  # one by one, to bound memory
+            return torch.stack([F.avg_pool2d(image.float(), 2).round().to(torch.uint8) for image in images])
+
+        mask = None if self.mask is None else half(self.mask[:, None])[:, 0]
+        return Photographs(half(self.images), resize_intrinsics(self.intrinsics, 0.5, 0.5), mask)
 
     def cameras(self, poses: Cameras) -> Cameras:
         """Returns the cameras of the photographs, with the poses of ``poses`` (B = 1)."""

@@ -72,7 +72,8 @@ def sharpened(
 ) -> Refined:
     """Continues a refinement on the photographs at their own size; arguments as for :func:`sharpen`."""
     began = clock()
-    sharp = sharpen(refined.scene, photographs, seen, renderer, options, seconds, refined.trained.cpu(), observe, clock)
+    trained, _ = split_views(len(seen.images), options.holdout)
+    sharp = sharpen(refined.scene, photographs, seen, renderer, options, seconds, trained, observe, clock)
     poses = replace(refined.scene.cameras, world_to_camera=sharp.scene.cameras.world_to_camera)
     scene = replace(sharp.scene, cameras=poses)
     if options.rates.cameras:

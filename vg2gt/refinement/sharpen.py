@@ -24,9 +24,11 @@ log = logging.getLogger(__name__)
 FINAL_RATE = 0.1  # factor to which rates decay exponentially
 FEWEST = 6  # with fewer views, none is left out
 SCORED = 3  # maximum number of left-out views
-CHECKS = 12  # number of times that left-out views are scored
-PATIENCE = 2  # checks below the best one after which the stage ends
-NOTICED = 0.05  # dB
+APART = 20  # minimum number of steps between two checks
+CHECKS = 8  # number of times that left-out views are scored
+PATIENCE = 3  # checks below the best one after which the stage ends
+NOTICED = 0.1  # dB
+HALVED = 2.5  # size of the photographs, in working sizes, from which the stage begins at half of it
 
 
 @dataclass(frozen=True)
@@ -98,9 +100,11 @@ class _Sharpening:
     ) -> None:
         assert options.full is not None
         self.options, self.full, self.loss = options, options.full, options.loss
-        self.photographs, self.seen, self.renderer = photographs, seen, renderer
+        self.whole, self.seen, self.renderer = photographs, seen, renderer
+        large = max(photographs.size) >= HALVED * max(start.cameras.size)
+        self.photographs = photographs.halved() if large and self.full.coarse else photographs
         self.intrinsics = start.cameras.intrinsics[0]
-        self.start = replace(start, cameras=photographs.cameras(start.cameras)).detach()
+        self.start = replace(start, cameras=self.photographs.cameras(start.cameras)).detach()
         self.clock, self.began, self.seconds = clock, clock(), seconds
         self.views = trained
         self.fold = fold_of(trained, self.full)
@@ -114,7 +118,7 @@ class _Sharpening:
         self.open = not len(self.fold)
         self.order = self._order()
         self.stretch = 1.0  # of the stage that is left to run
-        self.steps = self.growth = 0
+        self.steps = self.growth = self.checked = 0
         self.recent: list[float] = []
         self.scores: list[float] = []
 
@@ -132,6 +136,7 @@ class _Sharpening:
         except KeyboardInterrupt:
             ended = "interrupted"
         scene = self.start if ended == "no gain" else self.parameters.scene().detach()
+        scene = replace(scene, cameras=self.whole.cameras(scene.cameras))
         return Sharpened(
             scene=scene,
             steps=self.steps,
@@ -155,7 +160,7 @@ class _Sharpening:
 
     def _step(self) -> str:
         """Runs one step and what is due after it; returns how the stage ended, or an empty string."""
-        every = self.options.geometry_every
+        every = self.full.geometry_every
         of_step = self.loss.with_geometry(0 if self.steps % every else every)
         crop = self.order.deal()
         rows = self._rows(crop)
@@ -171,6 +176,8 @@ class _Sharpening:
         done = self._done()
         if done >= 1:
             return "overfitting" if self.stretch < 1 else "steps" if self.steps >= self.limit else "seconds"
+        if self.photographs is not self.whole and done >= self.full.coarse:
+            self._enlarge()
         if self.steps % self.full.grow_every == 0:
             self.parameters.prune()
             if done < self.full.grow_until:
@@ -191,10 +198,20 @@ class _Sharpening:
         rendered = replace(self.renderer, geometry=loss.needs_geometry)(scene.gaussians, camera)
         color = where_it_counts(scene.exposed(rendered.color, view)[0], seen.images, seen.mask)
         terms = loss.of_views(replace(rendered, color=color[None]), camera, seen, self.depth)
-        return loss.total(terms), float(psnr(color.detach(), seen.images).mean())
+        shown = color.detach()
+        if self.parameters.rates["gain"] and not self.open and crop.view in self.fold:
+            shown = matched(shown, seen.images)  # nothing else knows the exposure of a left-out view
+        return loss.total(terms), float(psnr(shown, seen.images).mean())
+
+    def _enlarge(self) -> None:
+        """Goes on from half to full size."""
+        self.photographs = self.whole
+        self.start = replace(self.start, cameras=self.whole.cameras(self.start.cameras))
+        self.parameters.start = self.start
+        self.order = self._order()
 
     def _grow(self, twice: bool = False) -> None:
-        cameras = self.start.cameras
+        cameras = self.whole.cameras(self.start.cameras)
         remove_idle(self.parameters, cameras, self.renderer, self.full.least)
         for factor in (1.5, 1.5) if twice else (1.0,):
             pixels = factor * self.full.footprint
@@ -210,8 +227,9 @@ class _Sharpening:
     def _watch(self, done: float) -> str:
         """Scores the left-out views if it is time; trains all views once these are worse, or late in the stage."""
         due = len(self.scores) * self.full.opened / CHECKS
-        if done >= due:
+        if done >= due and self.steps >= self.checked + APART:
             self.scores.append(self._score())
+            self.checked = self.steps
         best = max(self.scores)
         worse = len(self.scores) > PATIENCE and max(self.scores[-PATIENCE:]) < best - NOTICED
         if worse and best == self.scores[0]:
@@ -222,6 +240,14 @@ class _Sharpening:
             self.open = True
             self.order = self._order()
         return ""
+
+
+def matched(color: Tensor, images: Tensor) -> Tensor:
+    """Returns colours ``[R, 3, H, W]`` with the gain and bias of each channel that fit the images best."""
+    means = color.mean((2, 3), keepdim=True), images.mean((2, 3), keepdim=True)
+    centred = color - means[0]
+    gain = (centred * (images - means[1])).sum((2, 3), keepdim=True) / centred.square().sum((2, 3), keepdim=True)
+    return gain.nan_to_num(1.0) * centred + means[1]
 
 
 def fold_of(views: Tensor, options: FullSizeOptions) -> Tensor:
