@@ -86,7 +86,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     how_to_refine = [each for each in overrides if each.startswith(("refine=", "refine."))]
     overrides = [each for each in overrides if each not in how_to_refine]
     _check(options, overrides)
-    read_options("default", how_to_refine)  # reports wrong options before any work
+    read_options("photographs", how_to_refine)  # reports wrong options before any work
     with Monitor(show=not options.quiet, device=choose_device(options.device)) as monitor:
         with monitor.stage("load model"):
             ready = load_model(options.ckpt, overrides=overrides, device=options.device)

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 Quality = Literal["draft", "normal", "high"]
 RECORDINGS = ("RGBDFolder", "TUM")  # their measured poses fit their depth better than bundle adjustment does
-WITHOUT_PHOTOGRAPHS = 400  # steps at the working size, where there is no stage at full size
 
 
 def is_recording(scene: Scene) -> bool:
@@ -53,9 +52,8 @@ def refinement_for(
     given: dict[str, Any] = {key: value for key, value in changes.items() if value is not None}
     if not overrides and not scene.cameras_from:
         found = replace(found, rates=replace(found.rates, cameras=RefineRates().cameras))
-    if found.full is not None and not scene.pictures:
-        steps = found.steps if any(each.startswith("refine.steps=") for each in overrides) else WITHOUT_PHOTOGRAPHS
-        found = replace(found, full=None, steps=steps)
+    if not scene.pictures:  # only the working size can be refined
+        found = replace(found, full=None)
     if "seconds" in given and found.full is None:
         given = {"steps": None, **given}
     return replace(found, **given)

@@ -192,13 +192,13 @@ class FullSizeOptions:
     steps: int = 1500
     renderings: float = 40.0
     crop: int = 320
-    coarse: float = 0.3
+    coarse: float = 0.5
     rate: float = 0.5
     max_gaussians: int = 400_000
     footprint: float = 3.0
     least: float = 0.3
     grow_every: int = 150
-    grow_until: float = 0.6
+    grow_until: float = 0.4
     fold: int = 16
     opened: float = 0.7
     geometry_every: int = 8
