@@ -20,6 +20,7 @@ from vg2gt.monitor import Monitor
 from vg2gt.outputs.saved import near_of, read_scene
 from vg2gt.reconstruction.photographs import full_size, load_photographs
 from vg2gt.reconstruction.policy import refined_by_default, refinement_for
+from vg2gt.reconstruction.refined import _judged
 from vg2gt.reconstruction.scene import Scene
 from vg2gt.refinement import RefineOptions, RefineRates
 from vg2gt.rendering import Renderer
@@ -95,6 +96,11 @@ def test_photographs_at_their_own_size_are_those_of_the_views(
     assert (back - views.images).abs().mean() < 0.02
     moved = resize_intrinsics(cameras.intrinsics[0], factor, factor)
     torch.testing.assert_close(found.intrinsics, moved, atol=1e-3, rtol=0)
+
+
+def test_what_is_hardly_usable_is_said_with_its_causes() -> None:
+    assert _judged(24.04, 2) == "new views: about 24.0 dB (of 2 that were left out at first)"
+    assert "too far apart" in _judged(15.0, 1)
 
 
 def test_the_near_plane_is_that_of_the_scene(saved, tmp_path) -> None:

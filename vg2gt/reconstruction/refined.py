@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
     from vg2gt.reconstruction.scene import Scene
 
+USABLE = 17.0  # dB; scenes below it look like fog
 WORKING_SHARE = 0.45  # of the time, at most, for the stage at the working size
 
 
@@ -92,6 +93,18 @@ def _mean(psnr: Tensor) -> float:
     return float(psnr[psnr.isfinite()].mean()) if psnr.isfinite().any() else 0.0
 
 
+def _judged(psnr: float, views: int) -> str:
+    """Says how good a scene is by the PSNR of views before they were trained, and what may be wrong if it is not."""
+    said = f"new views: about {psnr:.1f} dB (of {views} that were left out at first)"
+    if psnr >= USABLE:
+        return said
+    return (
+        f"{said}; this is hardly usable. Likely causes: the photographs are too far apart (take more, in smaller "
+        "steps), the object turned before a visible room (mask the background), something moved, or cameras are wrong "
+        "(try --poses sfm)"
+    )
+
+
 def refinement_lines(scene: Scene) -> list[str]:
     """Returns a short table of a refinement (views, PSNR before and after, Gaussians); empty if there was none."""
     refined, lines = scene.refined, []
@@ -101,6 +114,8 @@ def refinement_lines(scene: Scene) -> list[str]:
         if len(views):
             before, after = (_mean(psnr[views]) for psnr in refined.psnr)
             lines.append(f"{name:<11} {len(views):>4} views: {before:6.2f} -> {after:6.2f} dB")
+    if (sharp := refined.sharpened) is not None and sharp.scores:
+        lines.append(_judged(sharp.scores[-1], len(sharp.fold)))
     before, after = len(refined.start.gaussians), len(refined.scene.gaussians)
     ended = {"interrupted": ", interrupted", "diverged": ", stopped because it diverged"}.get(refined.ended, "")
     lines.append(f"best state: step {refined.step} of {refined.steps}{ended}; Gaussians: {before} -> {after}")

@@ -198,10 +198,7 @@ class _Sharpening:
         rendered = replace(self.renderer, geometry=loss.needs_geometry)(scene.gaussians, camera)
         color = where_it_counts(scene.exposed(rendered.color, view)[0], seen.images, seen.mask)
         terms = loss.of_views(replace(rendered, color=color[None]), camera, seen, self.depth)
-        shown = color.detach()
-        if self.parameters.rates["gain"] and not self.open and crop.view in self.fold:
-            shown = matched(shown, seen.images)  # nothing else knows the exposure of a left-out view
-        return loss.total(terms), float(psnr(shown, seen.images).mean())
+        return loss.total(terms), float(psnr(color.detach(), seen.images).mean())
 
     def _enlarge(self) -> None:
         """Goes on from half to full size."""
@@ -219,10 +216,17 @@ class _Sharpening:
 
     @torch.no_grad()
     def _score(self) -> float:
-        """Returns the mean PSNR of the left-out views in dB."""
-        plain, scene = self.loss.with_geometry(0), self.parameters.scene()
-        crops = whole_views(self.photographs, self.fold)
-        return sum(self._terms(scene, crop, plain)[1] for crop in crops) / len(crops)
+        """Returns the mean PSNR of the left-out views at full size in dB."""
+        scene = self.parameters.scene()
+        scene = replace(scene, cameras=self.whole.cameras(scene.cameras))
+        plain, total = replace(self.renderer, geometry=False), 0.0
+        for crop in whole_views(self.whole, self.fold):
+            color = plain(scene.gaussians, crop.camera(scene.cameras)).color[0]
+            seen = crop.observations(self.whole, self.seen, self.intrinsics)
+            if self.parameters.rates["gain"]:
+                color = matched(color, seen.images)  # nothing else knows the exposure of a left-out view
+            total += float(psnr(where_it_counts(color, seen.images, seen.mask), seen.images).mean())
+        return total / len(self.fold)
 
     def _watch(self, done: float) -> str:
         """Scores the left-out views if it is time; trains all views once these are worse, or late in the stage."""
