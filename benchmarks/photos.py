@@ -84,6 +84,7 @@ class Scores:
             rendered, truth = torch.stack(shown), photos.images[list(views)]
             row[f"psnr{suffix}"] = float(psnr(rendered, truth).mean())
             row[f"ssim{suffix}"] = float(ssim(rendered, truth).mean())
+            row[f"detail{suffix}"] = float(_detail(rendered) / _detail(truth))
         if self.lpips is not None:
             row["lpips"] = float(self.lpips(rendered, truth).mean())
         self.panels[label] = [rendered[views.index(view)] for view in self._pictured()]
@@ -93,6 +94,11 @@ class Scores:
         held_out = self.photos.held_out
         count = min(PICTURED, len(held_out))
         return [held_out[i * (len(held_out) - 1) // max(count - 1, 1)] for i in range(count)]
+
+
+def _detail(images: Tensor) -> Tensor:
+    """Returns the mean difference of neighbouring pixels of images ``[V, 3, H, W]``: what blur takes away."""
+    return images.diff(dim=-1).abs().mean() + images.diff(dim=-2).abs().mean()
 
 
 def given_cameras(scene: Scene, photos: PhotoSet) -> Cameras:
@@ -131,7 +137,8 @@ def ours(
             continue
         restart_peak_memory()
         began = time.process_time()
-        options = replace(refinement, steps=None, seconds=budget - taken)
+        steps = None if refinement.full is None else refinement.steps  # of the stage at the working size
+        options = replace(refinement, steps=steps, seconds=budget - taken)
         refined = refine_scene(scene, options, clock=time.process_time)
         seconds = taken + time.process_time() - began
         assert refined.refined is not None
@@ -176,7 +183,8 @@ def warm_up(loaded: LoadedModel, photos: PhotoSet, refinement: RefineOptions) ->
     patch = loaded.model.backend.patch_size
     size = (max(2, photos.cameras.size[0] // patch // 4) * patch, max(2, photos.cameras.size[1] // patch // 4) * patch)
     scene = reconstruct_with(loaded.model, photos.folder, size=size, max_images=2, renderer=loaded.renderer)
-    refine_scene(scene, replace(refinement, steps=2, seconds=None))
+    full = None if refinement.full is None else replace(refinement.full, steps=9, crop=32)
+    refine_scene(scene, replace(refinement, steps=2, seconds=None, full=full))
 
 
 def merged(folder: Path, rows: Sequence[Row]) -> list[Row]:
@@ -209,6 +217,7 @@ def tables(rows: Sequence[Row]) -> str:
     shown = columns("psnr", "ssim", "lpips", "gaussians", decimals={"psnr": 2})
     for name in ("psnr", "ssim"):
         shown[f"{name}_given"] = replace(METRICS[name], label=f"{METRICS[name].label}, given")
+    shown["detail"] = Metric("detail", 2)
     shown |= {"steps": Metric("steps", 0), "core_seconds": Metric("core-s", 0), "peak_memory_mb": Metric("MB", 0)}
     cells = [
         [str(row[name]) for name in KEY[:-1]]
