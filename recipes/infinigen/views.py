@@ -241,7 +241,7 @@ def main() -> None:
     parser.add_argument("blend", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--seed", type=int, required=True)
-    parser.add_argument("--kind", choices=list(KINDS), required=True)
+    parser.add_argument("--kind", choices=list(PREFIXES), required=True)
     parser.add_argument("--views", type=int, default=60)
     parser.add_argument("--size", type=int, nargs=2, default=(112, 224), metavar=("HEIGHT", "WIDTH"))
     args = parser.parse_args()
