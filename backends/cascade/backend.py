@@ -20,7 +20,7 @@ from vg2gt.geometry.cameras import relative_to_first
 from vg2gt.geometry.precision import full_precision
 from vg2gt.types import Geometry, Hints, Tokens
 
-_STATE = ("context", "context_fine", "swept")
+_STATE = ("context", "context_fine", "swept", "origin")
 
 
 class CascadeBackend(Backend):

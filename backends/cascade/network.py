@@ -14,7 +14,7 @@ from backends.cascade.sweep import Matching, Stage
 from backends.sweep.correlate import SourceWarp
 from backends.sweep.features import CONTEXT_COARSE
 from backends.sweep.network import PosedViews
-from backends.sweep.refine import DepthHead, PlainBlock, RefineNet, activate, convex_upsample, slices
+from backends.sweep.refine import CELLS, DepthHead, PlainBlock, RefineNet, activate, convex_upsample, slices
 from backends.sweep.tokens import DIM, PATCH, POSITION_CHANNELS, TAPS, TokenBlock, patch_places
 from backends.sweep.views import relative_poses
 from backends.sweep.volume import agreement
@@ -39,7 +39,9 @@ class CascadeEncoding(NamedTuple):
         taps: patch tokens ``[V, P, DIM]`` of the last blocks.
         context: ``[V, C, h, w]``.
         context_fine: ``[V, C, 2 h, 2 w]``.
-        swept: log-depth of the last stage and its probability, ``[V, 2, 2 h, 2 w]``.
+        swept: log-depth of the last stage, its probability, that at 1/4 and the share of the matched depth in what the
+            stages are centred on, ``[V, 4, 2 h, 2 w]``.
+        origin: first channels of the last tap, for which decoding adds no direct correction, ``[V, P, 4]``.
         stages: the three stages, at 1/8, 1/4 and 1/2 of the image.
         guess: log-depth of the monocular branch at 1/8.
         centers: log-depth on which each stage but the first is centred, at 1/8 (matched or guessed), 1/4 and 1/2.
@@ -49,6 +51,7 @@ class CascadeEncoding(NamedTuple):
     context: Tensor
     context_fine: Tensor
     swept: Tensor
+    origin: Tensor
     stages: tuple[Stage, ...]
     guess: Tensor
     centers: tuple[Tensor, ...]
@@ -60,20 +63,20 @@ class CascadeNet(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.features = CascadePyramid()
-        self.matching = nn.ModuleList(Matching(channels) for channels in _CHANNELS)
+        self.matching = nn.ModuleList(Matching(channels, level == 0) for level, channels in enumerate(_CHANNELS))
         self.refine = RefineNet(CONTEXT_COARSE + _STATED, 3 + 36 + _SEEN)
         self.embed = nn.Sequential(
             nn.Linear(4 * CONTEXT_COARSE + _STATED + 3 + _SEEN, 2 * DIM), nn.GELU(), nn.Linear(2 * DIM, DIM)
         )
         self.position = nn.Linear(POSITION_CHANNELS, DIM)
-        self.blocks = nn.ModuleList(TokenBlock(DIM, 4, across=i % 2 == 1) for i in range(4))
+        self.blocks = nn.ModuleList(TokenBlock(DIM, 4, i % 2 == 1, 2 + 2 * (i % 2)) for i in range(4))
         self.fill = nn.Linear(DIM, 2)
         self.begin = nn.Conv2d(CONTEXT_COARSE + 6, 48, 3, 1, 1)
         self.block = PlainBlock(48)
         self.end = nn.Conv2d(48, 1 + 36, 3, 1, 1)
         self.embed_fine = nn.Sequential(nn.Linear(4 * 6 + 16 * 2, 2 * DIM), nn.GELU(), nn.Linear(2 * DIM, DIM))
-        self.head = DepthHead()
-        self.gate = nn.Parameter(torch.tensor([-1.5, 2.0, 4.0]))  # bias, mass, mass times greatest agreement
+        self.head = DepthHead(4)
+        self.gate = nn.Parameter(torch.tensor([-3.0, 4.0, 8.0]))  # bias, mass, mass times greatest agreement
         for layer in (self.fill, self.end, self.embed_fine[2]):
             nn.init.zeros_(layer.weight)  # pyright: ignore[reportArgumentType]
             nn.init.zeros_(layer.bias)  # pyright: ignore[reportArgumentType]
@@ -110,16 +113,16 @@ class CascadeNet(nn.Module):
         tokens = self.embed(patches.flatten(2).mT)
         sure = torch.stack((torch.ones_like(first.mass), first.mass, first.mass * agreeing[:, 1:2]), -1) @ self.gate
 
-        def blend(change: Tensor) -> tuple[Tensor, Tensor]:
-            """Log-depth, matched or guessed, and the guess."""
+        def blend(change: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            """Log-depth, matched or guessed, the guess, and the share of the matched one."""
             guess = scale + change[:, 1:2]
             share = torch.sigmoid(sure + change[:, 2:])
-            return share * (matched + 0.1 * change[:, :1]) + (1 - share) * guess, guess
+            return share * (matched + 0.1 * change[:, :1]) + (1 - share) * guess, guess, share
 
         place = self._places(blend(change)[0], scale, views, grid)
         tokens = self._attend(self.blocks[:2], tokens, place, grid, views.scenes)[-1]
         filled = F.pad(self.fill(tokens).mT.unflatten(-1, grid), (0, 0, 0, 0, 1, 0))
-        center, guess = blend(change + filled)
+        center, guess, share = blend(change + filled)
         # twice more, around that, with the best sources
         parallax = relative_poses(views.world_to_camera, sources)[..., :3, 3].norm(dim=-1)  # [V, n]
         parallax = parallax[..., None] * (-center.detach()).exp().flatten(1)[:, None]
@@ -141,13 +144,15 @@ class CascadeNet(nn.Module):
         tokens = tokens + self.embed_fine(torch.cat((F.pixel_unshuffle(known, 2), fine), 1).flatten(2).mT)
         place = self._places(F.avg_pool2d(log_depth, 4), scale, views, grid)
         taps = self._attend(self.blocks[2:], tokens, place, grid, views.scenes)
-        swept = torch.cat((log_depth, third.mass), 1)
+        sure = F.interpolate(torch.cat((F.avg_pool2d(second.mass, 2), share), 1), size=log_depth.shape[-2:])
+        swept = torch.cat((log_depth, third.mass, sure), 1)
         stages, centers = (first, second, third), (center, quarter, half)
         return CascadeEncoding(
             tuple(tap.float() for tap in taps[-TAPS:]),
             features.context,
             features.context_fine,
             swept,
+            taps[-1][..., : CELLS**2].float(),
             stages,
             guess,
             centers,
@@ -188,11 +193,11 @@ class CascadeNet(nn.Module):
             return patch_places(depth, *cameras, torch.stack((unit, unit), 1), grid, views.scenes)
 
     def decode(
-        self, taps: tuple[Tensor, ...], context: Tensor, context_fine: Tensor, swept: Tensor
+        self, taps: tuple[Tensor, ...], context: Tensor, context_fine: Tensor, swept: Tensor, origin: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Decodes depth and the log-scale of its relative error, each ``[V, H, W]``; see :class:`DepthHead`."""
         grid = (context.shape[-2] // 2, context.shape[-1] // 2)
-        log_depth, log_scale = self.head(taps, grid, context, context_fine, swept)
+        log_depth, log_scale = self.head(taps, grid, context, context_fine, swept, origin)
         return log_depth.clamp(-_LOG_DEPTH, _LOG_DEPTH).exp(), log_scale
 
 

@@ -27,7 +27,7 @@ from backends.cascade.network import CascadeNet
 from backends.sweep.network import PosedViews
 from recipes.cascade.objective import objective
 from recipes.cascade.samples import CascadeSamples, Sample
-from recipes.sweep.scenes import read_infinigen, scene_files
+from recipes.sweep.scenes import scene_files
 from vg2gt.io.files import write_bytes
 
 _LARGEST_GRADIENT = 1.0
@@ -77,7 +77,7 @@ class Training:
         if self.options.token_noise and self.step % 2:
             noise = torch.Generator().manual_seed(self.step)
             taps = tuple(tap + self.options.token_noise * torch.randn(tap.shape, generator=noise) for tap in taps)
-        decoded = self.net.decode(taps, encoding.context, encoding.context_fine, encoding.swept)
+        decoded = self.net.decode(taps, encoding.context, encoding.context_fine, encoding.swept, encoding.origin)
         loss, terms = objective(encoding, *decoded, sample)
         if not torch.isfinite(loss):
             raise RuntimeError(f"the objective is {float(loss)} at step {self.step}: {terms}")
@@ -115,7 +115,7 @@ def main(config: DictConfig) -> None:
     training = Training(config.training, begun)
     files = [file for part in config.scenes.parts for file in scene_files(config.scenes.folder, **part)]
     files = [file for file in files if file.is_file()] if config.scenes.rendered else files
-    rooms = read_infinigen(config.infinigen.folder, config.scenes.folder) if config.infinigen.folder else []
+    rooms = sorted(Path(config.infinigen.folder).glob("room_*.npz")) if config.infinigen.folder else []
     samples = CascadeSamples(files, config.seed, rooms, config.infinigen.share, **config.samples)
     print(f"step {training.step}, {len(files)} scenes, {len(rooms)} rooms, begun with {begun}", flush=True)
     made_of = {"options": OmegaConf.to_yaml(config)}
