@@ -39,9 +39,9 @@ def fused_volume(
     volume = torch.empty(views, planes, pixels, GROUPS + 1)
     seen = torch.empty(views, sources, pixels) if given is None else given.contiguous().clone()
     tensors = (channels_last, warp.sources, warp.at_infinity, warp.parallax, inverse)
-    first, second = weigh[0], weigh[2]
+    weight, bias, weight_out, bias_out = weigh.parameters()
     last = (visible.weight[0], visible.bias) if visible else (torch.zeros(3), torch.zeros(1))
-    layers = (first.weight.flatten(1).T, first.bias, second.weight.flatten(), second.bias, *last)
+    layers = (weight.flatten(1).T, bias, weight_out.flatten(), bias_out, *last)
     geometry = tuple(tensor.detach().contiguous().numpy() for tensor in tensors)
     network = tuple(tensor.detach().contiguous().numpy() for tensor in layers)
     _fused(geometry, network, warp.first, given is None, volume.numpy(), seen.numpy())

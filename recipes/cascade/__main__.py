@@ -93,9 +93,9 @@ class Training:
         self.seconds += time.process_time() - start
         return {"loss": float(loss.detach())} | {name: float(term.detach()) for name, term in terms.items()}
 
-    def write(self, out: Path, state: bool = True, **metadata: str) -> None:
+    def write(self, out: Path, config: DictConfig, state: bool = True) -> None:
         """Writes the averaged weights and, with ``state``, what training continues from, in half precision."""
-        made_of = {"step": str(self.step), "seconds": f"{self.seconds:.0f}", **metadata}
+        made_of = {"step": str(self.step), "seconds": f"{self.seconds:.0f}", "options": OmegaConf.to_yaml(config)}
         averaged = {name: value.half().contiguous() for name, value in self.averaged.items()}
         write_bytes(out / WEIGHTS, save(averaged, metadata=made_of))
         if state:
@@ -118,7 +118,6 @@ def main(config: DictConfig) -> None:
     rooms = sorted(Path(config.infinigen.folder).glob("room_*.npz")) if config.infinigen.folder else []
     samples = CascadeSamples(files, config.seed, rooms, config.infinigen.share, **config.samples)
     print(f"step {training.step}, {len(files)} scenes, {len(rooms)} rooms, begun with {begun}", flush=True)
-    made_of = {"options": OmegaConf.to_yaml(config)}
     told: list[int] = []
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *given: told.append(given[0]))
@@ -136,9 +135,9 @@ def main(config: DictConfig) -> None:
             rate = (time.monotonic() - start) / (training.step - first)
             print(f"{training.step} {rate:.2f} s/step {training.seconds / 3600:.2f} h {shown}", flush=True)
         if not config.cooldown and time.monotonic() - written > 60 * config.save_minutes:
-            training.write(out, **made_of)
+            training.write(out, config)
             written = time.monotonic()
-    training.write(out / "cooled" if config.cooldown else out, not config.cooldown, **made_of)
+    training.write(out / "cooled" if config.cooldown else out, config, not config.cooldown)
 
 
 if __name__ == "__main__":
