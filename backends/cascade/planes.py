@@ -11,10 +11,10 @@ from torch.nn import functional as F
 from backends.sweep.views import camera_distances, choose_sources
 
 COARSE_SOURCES, FINE_SOURCES = 6, 3
-_NEAREST = 0.12  # depth of the nearest plane, in baselines
-_BEND = 4.0  # planes nearer than this many baselines are spaced in log-depth, farther ones in inverse depth
+_NEAREST = 0.15  # depth of the nearest plane, in baselines
+_BEND = 40.0  # planes nearer than this many baselines are spaced in log-depth, farther ones in inverse depth
 _SPAN = math.log1p(_BEND / _NEAREST)
-FARTHEST = 0.1 / 63  # smallest position of a hypothesis: several hundred baselines away
+FARTHEST = 0.1 / 63  # smallest position of a hypothesis: thousands of baselines away
 _SCORED = (0.7, 30.0)  # near and far, in baselines, of the points whose visibility scores the sources
 _LEAST_BASELINE = 0.02  # in units of the largest distance between cameras
 _ENOUGH_PARALLAX, _WIDE_PARALLAX = 0.06, 0.4  # baseline over depth: see fine_sources
@@ -76,7 +76,7 @@ def fine_sources(visible: Tensor, parallax: Tensor, count: int = FINE_SOURCES) -
 class Planes:
     """Positions of depth planes from infinity (0) to a fraction of a view's baseline (1).
 
-    The position is ``log(1 + 4 b / depth)`` over its largest value, b being the view's baseline: far planes are spaced
+    The position is ``log(1 + 40 b / depth)`` over its largest value, b being the view's baseline: far planes are spaced
     evenly in inverse depth, that is in disparity, and near ones in log-depth.
 
     Args:

@@ -86,7 +86,7 @@ class Training:
         torch.nn.utils.clip_grad_norm_(self.net.parameters(), _LARGEST_GRADIENT, error_if_nonfinite=True)
         self.optimizer.step()
         # shorter at the beginning, so that the first weights are forgotten
-        keep = min(self.options.average, (self.step + 1) / (self.step + 20))
+        keep = min(self.options.average, (self.step + 1) / (self.step + 5))
         for name, value in self.net.state_dict().items():
             self.averaged[name].lerp_(value.float(), 1 - keep)
         self.step, self.here = self.step + 1, self.here + 1

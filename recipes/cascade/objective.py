@@ -13,7 +13,7 @@ from recipes.cascade.samples import Sample
 from recipes.sweep.objective import cell_inverse
 
 _CLAMP = 2.0  # log-depth errors are clamped to this
-_BEYOND = 0.5 / (PLANES - 1)  # position from which on any greater depth counts as correct, as for sky
+_BEYOND = 1.5 / (PLANES - 1)  # position from which on any greater depth counts as correct, as for sky
 _ROOM = 1.0  # up to this much log-depth farther, so that depth does not diverge
 _BEYOND_ERROR = 0.7  # minimum relative error that the uncertainty of such pixels is trained on
 WEIGHTS = {

@@ -46,11 +46,11 @@ def test_planes_reach_from_infinity_to_a_fraction_of_the_baseline() -> None:
     planes = Planes(torch.tensor([0.5, 3.0]))
     position = torch.linspace(0, 1, PLANES).view(1, -1, 1, 1).expand(2, -1, -1, -1)
     inverse = planes.inverse(position)
-    assert (inverse[:, -1].flatten() * torch.tensor([0.5, 3.0])).tolist() == pytest.approx([1 / 0.12] * 2, rel=1e-4)
-    assert (inverse[:, 0].flatten() * torch.tensor([0.5, 3.0]) < 1 / 500).all()
+    assert (inverse[:, -1].flatten() * torch.tensor([0.5, 3.0])).tolist() == pytest.approx([1 / 0.15] * 2, rel=1e-4)
+    assert (inverse[:, 0].flatten() * torch.tensor([0.5, 3.0]) < 1 / 1000).all()
     torch.testing.assert_close(planes.position(-inverse.log()), position.clamp_min(FARTHEST), rtol=1e-3, atol=1e-5)
     disparity, ratio = inverse.diff(dim=1), (inverse[:, 1:] / inverse[:, :-1]).log()
-    assert float(disparity[0, 1] / disparity[0, 4]) == pytest.approx(1, abs=0.2)
+    assert float(disparity[0, 1] / disparity[0, 4]) == pytest.approx(0.77, abs=0.05)
     assert float(ratio[0, -1] / ratio[0, -5]) == pytest.approx(1, abs=0.02)
 
 
