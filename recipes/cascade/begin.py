@@ -34,6 +34,9 @@ def begin(net: CascadeNet, file: Path) -> int:
         elif name == "refine.begin.0.weight":
             assert given is not None
             value.copy_(_by_columns(value, given, {0: range(CONTEXT_COARSE), -20: range(-20, 0)}))
+        elif name == "head.fine.0.weight":
+            assert given is not None
+            value[:, : given.shape[1]], value[:, given.shape[1] :] = given.to(value), 0
         elif given is not None and given.shape == value.shape:
             value.copy_(given)
         else:
@@ -45,6 +48,8 @@ def begin(net: CascadeNet, file: Path) -> int:
     weight[:, :context] = given[:, :context].to(weight)
     weight[:, context + 5 : context + 21] = given[:, -16:].to(weight)
     new["embed.0.bias"].copy_(old["tokens.embed.0.bias"])
+    for part in ("weight", "bias"):
+        new[f"head.out.{part}"][0] = 0  # the head read other tokens: begin with the matched depth
     net.load_state_dict(new)
     return copied + weight.numel()
 
