@@ -2,8 +2,9 @@
 
 Only cameras are given; the network finds the depth range. Scenes are procedural ones on which nothing was trained, with
 ``--shared FOLDER`` also real recordings, and with ``--infinigen FOLDER`` rooms of Infinigen. ``--itermvs FOLDER`` runs
-IterMVS (``examples/backends``) on the same views. Depth is compared after
-alignment by one median scale per set of views, except ``raw``. Prints a table and writes a dated JSON file.
+IterMVS (``examples/backends``) on the same views, ``--cascade FILE`` the plane sweep in training (``recipes/cascade``).
+Depth is compared after alignment by one median scale per set of views, except ``raw``. Prints a table and writes a
+dated JSON file.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from common import machine, parser, write_results
 from hydra.utils import instantiate
 
 from backends.base import Backend
+from backends.cascade import CascadeBackend
 from backends.sweep import SweepBackend
 from examples.backends.itermvs import IterMVSBackend
 from vg2gt import __version__
@@ -87,6 +89,7 @@ def main() -> None:
     arguments.add_argument("--weights", help="safetensors file instead of the shipped weights")
     arguments.add_argument("--scenes", type=int, default=16, help="number of procedural scenes of a kind")
     arguments.add_argument("--itermvs", type=Path, help="checkout of FangjinhuaWang/IterMVS: measures it as well")
+    arguments.add_argument("--cascade", help="weights of the cascade: measures it as well")
     options = arguments.parse_args()
     torch.set_num_threads(1)
     backend = SweepBackend(path=options.weights)
@@ -94,6 +97,8 @@ def main() -> None:
     if options.itermvs:
         weights = options.itermvs / "checkpoints/blendedmvs/model_000015.ckpt"
         backends[", IterMVS"] = IterMVSBackend(path=str(weights))
+    if options.cascade:
+        backends[", cascade"] = CascadeBackend(path=options.cascade)
     sets: dict[str, dict[str, float]] = {}
     for (name, overrides), (suffix, network) in product(SETS.items(), backends.items()):
         if any(f"{{{place}}}" in overrides and not getattr(options, place) for place in ("shared", "infinigen")):
@@ -106,7 +111,8 @@ def main() -> None:
         print(f"{name + suffix:18}", " ".join(f"{key} {value:.4f}" for key, value in figures.items() if " " not in key))
         kinds = (f"{kind} {figures[f'share {kind}']:.0%} {figures[f'abs_rel {kind}']:.3f}" for kind in KINDS)
         print(" " * 18, ", ".join(kinds), flush=True)
-    content = {"machine": machine(), "version": __version__, "weights": backend.identity()["weights"], "sets": sets}
+    weights = {suffix.strip(", ") or "sweep": network.identity()["weights"] for suffix, network in backends.items()}
+    content = {"machine": machine(), "version": __version__, "weights": weights, "sets": sets}
     write_results(options.out, "plane_sweep", content)
 
 

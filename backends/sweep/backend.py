@@ -20,8 +20,8 @@ from vg2gt.types import Geometry, Hints, Tokens
 
 SHIPPED = Path(__file__).parent / "weights" / "sweep.safetensors"
 LICENCE = "Apache-2.0"
-_CONFIDENCE = (0.37, 400.0)  # bounds of 1 / expected relative error
-_NO_PARALLAX = (
+CONFIDENCE = (0.37, 400.0)  # bounds of 1 / expected relative error
+NO_PARALLAX = (
     "backend sweep estimates depth from parallax, but got a single view, or all cameras are at the same position: take "
     "photos from different positions, or choose a single-image backend (backend=vggt_1b, backend=da3_small, ...)"
 )
@@ -77,7 +77,7 @@ class SweepBackend(Backend):
             for scene, pictures in enumerate(images.float()):
                 views = PosedViews(pictures, cameras.world_to_camera[scene], cameras.intrinsics[scene])
                 if not (camera_distances(views.world_to_camera) > 0).any():
-                    raise ValueError(_NO_PARALLAX)
+                    raise ValueError(NO_PARALLAX)
                 features = self.network.features(pictures)
                 hint = None if hints.depth_range is None else hints.depth_range[scene].float()
                 depth_range = self.network.find_range(features, views, self.sources, hint)
@@ -100,6 +100,6 @@ class SweepBackend(Backend):
             depth, log_scale = self.network.decode(
                 taps, *(state[name].flatten(0, 1) for name in ("context", "context_fine", "swept"))
             )
-            confidence = torch.exp(-log_scale).clamp(*_CONFIDENCE)
+            confidence = torch.exp(-log_scale).clamp(*CONFIDENCE)
         depth, confidence = (each.unflatten(0, (scenes, views)) for each in (depth, confidence))
         return Geometry(depth, confidence, state["cameras"], torch.ones_like(depth[:, 0, 0, 0]))

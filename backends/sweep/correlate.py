@@ -131,7 +131,7 @@ class _Correlate(torch.autograd.Function):
 
 
 @kernel(fastmath=True, error_model="numpy", nogil=True, inline="always")
-def _sample(at_infinity, parallax, p, inverse, height, width):
+def sample_at(at_infinity, parallax, p, inverse, height, width):
     """Rows, columns and bilinear weights of the four pixels around a point in the source, and whether it is inside."""
     z = at_infinity[2, p] + parallax[2, 0] * inverse
     safe = max(z, np.float32(BEHIND))
@@ -156,7 +156,7 @@ def _forward(geometry, first, similarity, inside):
             other = sources[view, n]
             for d in range(inverse.shape[1]):
                 for p in range(height * width):
-                    (y, y1), (x, x1), (w00, w01, w10, w11), within = _sample(
+                    (y, y1), (x, x1), (w00, w01, w10, w11), within = sample_at(
                         at_infinity[view, n], parallax[view, n], p, inverse[view, d, p], height, width
                     )
                     inside[view, n, d, p] = within
@@ -182,7 +182,7 @@ def _backward(geometry, first, gradient, out):
             other = sources[view, n]
             for d in range(inverse.shape[1]):
                 for p in range(height * width):
-                    (y, y1), (x, x1), (w00, w01, w10, w11), within = _sample(
+                    (y, y1), (x, x1), (w00, w01, w10, w11), within = sample_at(
                         at_infinity[view, n], parallax[view, n], p, inverse[view, d, p], height, width
                     )
                     if not within:

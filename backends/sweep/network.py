@@ -156,14 +156,14 @@ class SweepNet(nn.Module):
             counts = (sweep.mass > 0.4) & (sweep.t >= least)
             return agreed_range(1 / to_inverse(sweep.t, wide), agreeing[:, 1:2] * counts, fallback)
 
+        beyond = 1 / (WIDE_PLANES - 1)  # sky and windows agree at any large depth, between the last two planes
         if hint is not None:
-            found = search(hint * hint.new_tensor(_BEYOND), hint)
+            found = search(hint * hint.new_tensor(_BEYOND), hint, least=beyond)
             found = torch.stack((torch.minimum(found[0], hint[0]), torch.maximum(found[1], hint[1])))
         else:
             wide = wide_range(views.world_to_camera)
             first = search(wide, wide)
-            # Sky and windows agree at any large depth, between the last two planes: ignore those.
-            found = search(torch.stack((_NEARER * first[0], wide[1])), first, least=1 / (WIDE_PLANES - 1))
+            found = search(torch.stack((_NEARER * first[0], wide[1])), first, least=beyond)
         return view_ranges(views.world_to_camera, views.intrinsics, views.size, found)
 
     def encode(

@@ -87,22 +87,31 @@ class DepthHead(nn.Module):
 
     The first correction is linear: the first four channels of the last tap, one per 2x2 cell of the patch, times
     ``RESPONSE``. It makes depth change smoothly with the tokens. The second is predicted from all taps by convolutions.
+
+    Args:
+        stated: channels of ``swept``.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, stated: int = 2) -> None:
         super().__init__()
         self.norms = nn.ModuleList(nn.LayerNorm(DIM) for _ in range(TAPS))
         self.spread = nn.Linear(TAPS * DIM, CELLS**2 * _SPREAD)
         self.coarse = nn.Sequential(nn.Conv2d(_SPREAD + CONTEXT_COARSE, 64, 3, 1, 1), PlainBlock(64), PlainBlock(64))
         self.lift = nn.Conv2d(64, 48, 1)
-        self.fine = nn.Sequential(nn.Conv2d(48 + CONTEXT_FINE + 2, 48, 3, 1, 1), PlainBlock(48))
+        self.fine = nn.Sequential(nn.Conv2d(48 + CONTEXT_FINE + stated, 48, 3, 1, 1), PlainBlock(48))
         self.out = nn.Conv2d(48, 2, 3, 1, 1)
         self.mask = nn.Sequential(nn.Conv2d(48, 64, 1), nn.ReLU(), nn.Conv2d(64, 9 * 4, 1))
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)  # type: ignore[arg-type]
 
     def forward(
-        self, taps: tuple[Tensor, ...], grid: tuple[int, int], context: Tensor, context_fine: Tensor, swept: Tensor
+        self,
+        taps: tuple[Tensor, ...],
+        grid: tuple[int, int],
+        context: Tensor,
+        context_fine: Tensor,
+        swept: Tensor,
+        origin: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Decodes log-depth and the log-scale of its error, each ``[V, 4 h, 4 w]``.
 
@@ -111,12 +120,15 @@ class DepthHead(nn.Module):
             grid: patches per axis.
             context: ``[V, CONTEXT_COARSE, h, w]``, at 1/4 of the image.
             context_fine: ``[V, CONTEXT_FINE, 2 h, 2 w]``.
-            swept: log-depth of the sweep and its probability, ``[V, 2, 2 h, 2 w]``.
+            swept: log-depth of the sweep, its probability and further channels, ``[V, stated, 2 h, 2 w]``.
+            origin: the first four channels of the last tap for which the first correction is zero ``[V, P, 4]``; None:
+                zero.
         """
         # tokens to cells of half a patch: [V, P, DIM] to [V, C, h, w]
         said = torch.cat([norm(tap) for norm, tap in zip(self.norms, taps, strict=True)], -1)
         said = F.pixel_shuffle(self.spread(said).mT.unflatten(-1, grid), CELLS)  # [V, C, h, w]
-        correction = F.pixel_shuffle(taps[-1][..., : CELLS**2].mT.unflatten(-1, grid), CELLS)
+        correction = taps[-1][..., : CELLS**2] - (0 if origin is None else origin)
+        correction = F.pixel_shuffle(correction.mT.unflatten(-1, grid), CELLS)
         x = self.lift(activate(self.coarse(torch.cat((said, context), 1))))
         # to the sweep's resolution: [V, ., 2 h, 2 w]
         x, correction = (upsample(each, swept) for each in (x, correction))

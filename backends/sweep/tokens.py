@@ -20,11 +20,11 @@ POSITION_CHANNELS = 3 + 3 + 6 * len(_WAVENUMBERS) + 4 * _IMAGE_WAVES
 
 
 class TokenBlock(nn.Module):
-    """Pre-norm transformer block; keys and values are 2x2-pooled tokens of its own view, or of all (``across``)."""
+    """Pre-norm transformer block; keys and values are pooled tokens of its own view, or of all (``across``)."""
 
-    def __init__(self, dim: int, heads: int, across: bool) -> None:
+    def __init__(self, dim: int, heads: int, across: bool, pool: int = 2) -> None:
         super().__init__()
-        self.heads, self.across = heads, across
+        self.heads, self.across, self.pool = heads, across, pool
         self.norm, self.norm_mlp = nn.LayerNorm(dim), nn.LayerNorm(dim)
         self.query, self.key_value, self.out = nn.Linear(dim, dim), nn.Linear(dim, 2 * dim), nn.Linear(dim, dim)
         self.mlp = nn.Sequential(nn.Linear(dim, 3 * dim), nn.GELU(), nn.Linear(3 * dim, dim))
@@ -41,7 +41,7 @@ class TokenBlock(nn.Module):
         views, patches, dim = x.shape
         placed = self.norm(x) + position
         query = self.query(placed)
-        keys = F.avg_pool2d(placed.mT.unflatten(-1, grid), 2, ceil_mode=True).flatten(2).mT  # [V, P/4, dim]
+        keys = F.avg_pool2d(placed.mT.unflatten(-1, grid), self.pool, ceil_mode=True).flatten(2).mT
         if self.across:
             query, keys = query.reshape(scenes, -1, dim), keys.reshape(scenes, -1, dim)
         parts = (query, *self.key_value(keys).chunk(2, -1))

@@ -81,15 +81,15 @@ class PlaneBlock(nn.Module):
 class VolumeNet(nn.Module):
     """Light 2.5D regularisation of a volume to one logit per plane, at full and half resolution."""
 
-    def __init__(self) -> None:
+    def __init__(self, channels: int = 16) -> None:
         super().__init__()
-        self.begin = nn.Conv2d(GROUPS + 1, 16, 3, 1, 1)
-        self.first = PlaneBlock(16)
-        self.down = nn.Conv2d(16, 32, 2, 2)
-        self.coarse = nn.ModuleList(PlaneBlock(32) for _ in range(2))
-        self.up = nn.Conv2d(32, 16, 1)
-        self.last = PlaneBlock(16)
-        self.end = nn.Conv2d(16, 1, 1)
+        self.begin = nn.Conv2d(GROUPS + 1, channels, 3, 1, 1)
+        self.first = PlaneBlock(channels)
+        self.down = nn.Conv2d(channels, 2 * channels, 2, 2)
+        self.coarse = nn.ModuleList(PlaneBlock(2 * channels) for _ in range(2))
+        self.up = nn.Conv2d(2 * channels, channels, 1)
+        self.last = PlaneBlock(channels)
+        self.end = nn.Conv2d(channels, 1, 1)
         self.sharpness = nn.Parameter(torch.tensor(6.0))  # adds the similarity to the logits, also before training
 
     def forward(self, volume: Tensor, planes: int) -> Tensor:
@@ -124,12 +124,13 @@ def expectation(logits: Tensor, positions: Tensor) -> tuple[Tensor, Tensor]:
     return mean, mass
 
 
-def agreement(inverse: Tensor, warp: SourceWarp) -> Tensor:
+def agreement(inverse: Tensor, warp: SourceWarp, width: float = _AGREEMENT_WIDTH) -> Tensor:
     """Compares each view's depth with the depth of its sources.
 
     Args:
         inverse: inverse depth of all views ``[V, 1, h, w]``.
         warp: correspondences of all views.
+        width: relative difference at which agreement falls to 1/e.
 
     Returns:
         ``[V, 3, h, w]``: mean and maximum agreement over the sources, in [0, 1], and 3 times their mean relative
@@ -141,7 +142,7 @@ def agreement(inverse: Tensor, warp: SourceWarp) -> Tensor:
         grid, inside, z = warp(source, inverse.flatten(2))
         there = F.grid_sample(inverse[warp.sources[:, source]], grid, padding_mode="border", align_corners=False)
         difference = there[:, :, 0] * (z / inverse.flatten(2)).clamp_min(BEHIND) - 1
-        agreements.append(torch.exp(-difference.abs() / _AGREEMENT_WIDTH) * inside)
+        agreements.append(torch.exp(-difference.abs() / width) * inside)
         differences.append(difference.clamp(-0.3, 0.3) * inside)
     every = torch.stack(agreements)  # [n, V, 1, h w]
     summary = (every.mean(0), every.amax(0), 3 * torch.stack(differences).mean(0))

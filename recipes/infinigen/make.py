@@ -4,8 +4,8 @@ Makes one room after another on one thread: about 15 core-minutes for a room, an
 after an interruption, run the same command again; finished rooms and views are kept. Needs only the standard library;
 Infinigen and Blender are installed into an environment of their own (``OUT/environment``, or ``--env``).
 
-Results: ``OUT/train/room_NNNN`` and ``OUT/held_out/room_NNNN``, and their paths as scenes in ``OUT/paths``, folders for
-``data=infinigen``; ``OUT/log.csv`` with the time of every stage. A room that fails leaves
+Results: ``OUT/train/room_NNNN``, ``OUT/held_out/room_NNNN`` and ``OUT/test/room_NNNN``, and their paths as scenes in
+``OUT/paths``, folders for ``data=infinigen``; ``OUT/log.csv`` with the time of every stage. A room that fails leaves
 ``OUT/work/room_NNNN/failed.txt`` and is skipped from then on. A room that does not pass the check goes to
 ``OUT/rejected``.
 """
@@ -28,6 +28,9 @@ INFINIGEN, BLENDER = "infinigen==1.15.5", "bpy==4.2.0"
 # Infinigen's name of a kind of room, and prefix of the names of its floors.
 KINDS = {"DiningRoom": "dining-room", "LivingRoom": "living-room"}
 KINDS |= {"Bedroom": "bedroom", "Kitchen": "kitchen", "Bathroom": "bathroom"}
+PREFIXES = KINDS | {"Hallway": "hallway", "Garage": "garage", "Utility": "utility"}
+TEST = {int(seed): name for seed, name in json.loads((HERE / "test_rooms.json").read_text()).items()}
+"""Rooms that report a result and never choose one, by seed."""
 HELD_OUT = (3, 7, 10, 14, 16, 24, 28, 30, 32, 36)
 """Seeds excluded from training: two rooms of each kind among the first forty."""
 _THREADS = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "MKL", "OPENBLAS", "NUMBA")}
@@ -41,8 +44,8 @@ _FASTER = (
 
 
 def kind(seed: int) -> str:
-    """Returns Infinigen's name of the kind of room for a seed; kinds alternate."""
-    return list(KINDS)[seed % len(KINDS)]
+    """Returns Infinigen's name of the kind of room for a seed; kinds alternate, except in the test rooms."""
+    return TEST.get(seed) or list(KINDS)[seed % len(KINDS)]
 
 
 def make_environment(env: Path, python: str) -> Path:
@@ -128,7 +131,7 @@ class Rooms:
         """Makes one room, unless it exists or failed before."""
         room = f"room_{seed:04d}"
         work = self.out / "work" / room
-        if any((self.out / place / room).exists() for place in ("train", "held_out", "rejected")):
+        if any((self.out / place / room).exists() for place in ("train", "held_out", "test", "rejected")):
             return
         if (work / "failed.txt").exists():
             print(f"{room} failed before ({work / 'failed.txt'}); remove that file to try it again", flush=True)
@@ -162,7 +165,7 @@ class Rooms:
         figures = json.loads((work / "check.json").read_text().splitlines()[-1])
         (views / "check.json").write_text(json.dumps(figures | {"seed": seed, "kind": kind(seed)}) + "\n")
         print(f"{room} ({kind(seed)}): {figures}", flush=True)
-        accepted = "held_out" if seed in HELD_OUT else "train"
+        accepted = "test" if seed in TEST else "held_out" if seed in HELD_OUT else "train"
         place = self.out / (accepted if figures["ok"] else "rejected")
         place.mkdir(exist_ok=True)
         views.rename(place / room)
@@ -191,6 +194,7 @@ def main() -> None:
     parser.add_argument(
         "--rooms", type=int, default=40, help="number of rooms, seeds 0 to N-1; ten of the first 40 are held out"
     )
+    parser.add_argument("--seeds", type=int, nargs="+", help="these seeds instead, such as those of the test rooms")
     parser.add_argument("--out", type=Path, required=True, help="output folder")
     parser.add_argument("--views", type=int, default=60, help="views per room")
     parser.add_argument("--size", type=int, nargs=2, default=(112, 224), metavar=("HEIGHT", "WIDTH"))
@@ -199,12 +203,12 @@ def main() -> None:
     args = parser.parse_args()
     out = args.out.resolve()
     out.mkdir(parents=True, exist_ok=True)
-    for place in ("train", "held_out"):
+    for place in ("train", "held_out", "test"):
         for room in sorted((out / place).glob("room_*")):
             link_paths(room)
     interpreter = make_environment((args.env or out / "environment").resolve(), args.python)
     rooms = Rooms(out, interpreter, args.views, args.size)
-    for seed in range(args.rooms):
+    for seed in args.seeds or range(args.rooms):
         rooms.make(seed)
 
 

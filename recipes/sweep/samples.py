@@ -112,21 +112,23 @@ class TrainingSamples(Dataset[Sample]):
         while True:
             files = self.more if self.share and rng.random() < self.share else self.files
             path = files[rng.integers(len(files))]
-            views = _choose_views(read_scene(path), self.views, self.any_views, rng)
-            views = _turn(_crop(views, size, rng), turns)
+            views = choose_views(read_scene(path), self.views, self.any_views, rng)
+            views = turn(crop(views, size, rng), turns)
             valid = views.depth[(views.depth > 0) & views.depth.isfinite()]
             if len(valid) >= _LEAST_PIXELS:
                 return _finish(views, valid, _CUT_INDOORS if is_room(path) else _CUT, sources, rng)
 
 
-class _Crop(NamedTuple):
+class Crop(NamedTuple):
+    """Views cut from a scene, as in :class:`Sample`."""
+
     images: Tensor  # [V, 3, H, W] in [0, 1]
     depth: Tensor
     world_to_camera: Tensor
     intrinsics: Tensor  # [V, 3, 3]
 
 
-def _choose_views(scene: SceneFrames, count: int, any_views: float, rng: Generator) -> _Crop:
+def choose_views(scene: SceneFrames, count: int, any_views: float, rng: Generator) -> Crop:
     """Draws overlapping views: from a section of a walk, or for other paths, by overlap with a random view."""
     rotations = scene.world_to_camera[:, :3, :3]
     frames = len(scene.images)
@@ -142,7 +144,7 @@ def _choose_views(scene: SceneFrames, count: int, any_views: float, rng: Generat
     else:
         rows = _overlapping(scene, count, any_views, rng)
     images = scene.images[rows].permute(0, 3, 1, 2).float() / 255
-    return _Crop(images, scene.depth[rows].float(), scene.world_to_camera[rows], scene.intrinsics[rows])
+    return Crop(images, scene.depth[rows].float(), scene.world_to_camera[rows], scene.intrinsics[rows])
 
 
 def _overlapping(scene: SceneFrames, count: int, any_views: float, rng: Generator) -> NDArray[np.int64]:
@@ -173,7 +175,7 @@ def _angle(first: Tensor, second: Tensor) -> float:
     return math.acos(max(-1.0, min(1.0, cosine)))
 
 
-def _crop(views: _Crop, target: tuple[int, int], rng: Generator) -> _Crop:
+def crop(views: Crop, target: tuple[int, int], rng: Generator) -> Crop:
     """Crops all views to one random window and resizes them to ``target`` (height, width); mirrors half the samples."""
     height, width = views.depth.shape[-2:]
     most = min(height / target[0], width / target[1])
@@ -191,10 +193,10 @@ def _crop(views: _Crop, target: tuple[int, int], rng: Generator) -> _Crop:
         intrinsics[:, 0, 2] = target[1] - 1 - intrinsics[:, 0, 2]
         mirror = torch.diag(torch.tensor([-1.0, 1, 1, 1]))
         poses = mirror @ poses @ mirror
-    return _Crop(images.clamp(0, 1), depth, poses.clone(), intrinsics)
+    return Crop(images.clamp(0, 1), depth, poses.clone(), intrinsics)
 
 
-def _turn(views: _Crop, turns: int) -> _Crop:
+def turn(views: Crop, turns: int) -> Crop:
     """Rotates all views by 90 degrees to the left, ``turns`` times."""
     images, depth, poses, intrinsics = views
     turn = torch.tensor([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
@@ -204,10 +206,10 @@ def _turn(views: _Crop, turns: int) -> _Crop:
         turned[:, 0, 2], turned[:, 1, 2] = intrinsics[:, 1, 2], images.shape[-1] - 1 - intrinsics[:, 0, 2]
         images, depth = images.rot90(1, (-2, -1)), depth.rot90(1, (-2, -1))
         poses, intrinsics = turn @ poses, turned
-    return _Crop(images.contiguous(), depth.contiguous(), poses, intrinsics)
+    return Crop(images.contiguous(), depth.contiguous(), poses, intrinsics)
 
 
-def _finish(views: _Crop, valid: Tensor, cut: tuple[float, float], sources: int, rng: Generator) -> Sample:
+def _finish(views: Crop, valid: Tensor, cut: tuple[float, float], sources: int, rng: Generator) -> Sample:
     """Draws the unit of length, the range of the planes, pose noise, sources and colours of a sample.
 
     The range contains the true one, except in some samples whose planes end at a depth quantile within ``cut``.

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from examples.worlds import Worlds
 from examples.worlds.photograph import Photograph
+from recipes.infinigen.slim import read_slim
 from vg2gt.data.sources.infinigen import Infinigen
 from vg2gt.data.synthetic.synthetic_scene import LOBES, SyntheticScene
 from vg2gt.geometry.cameras import rigid_motions
@@ -62,12 +63,14 @@ def scene_files(folder: str | os.PathLike[str], count: int, first_seed: int, siz
 def is_room(path: Path) -> bool:
     """Returns whether a scene is a room."""
     first = path.stem.split("-")[0]
-    return first == "infinigen" or _KINDS[int(first) % len(_KINDS)] in ("room", "wide")
+    return first == "infinigen" or first.startswith("room_") or _KINDS[int(first) % len(_KINDS)] in ("room", "wide")
 
 
 def read_scene(path: Path) -> SceneFrames:
-    """Reads the frames of a scene; renders a procedural one that is missing, and keeps it."""
-    if path.is_file():
+    """Reads the frames of a scene or of a slim room; renders a procedural scene that is missing, and keeps it."""
+    if path.is_file() and path.stem.startswith("room_"):
+        arrays = read_slim(path)
+    elif path.is_file():
         arrays = read_npz(path, SceneFrames._fields)
     else:
         seed, size = path.stem.split("-")

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -11,6 +12,7 @@ from backends.sweep.correlate import GROUPS, SourceWarp, correlate, correlate_re
 from backends.sweep.network import PosedViews
 from backends.sweep.views import agreed_range, choose_sources, view_ranges, wide_range
 from backends.sweep.volume import agreement
+from examples.worlds import Worlds
 from vg2gt.data import SyntheticScenes
 from vg2gt.types import Batch, Cameras, Hints
 
@@ -186,3 +188,20 @@ def test_the_range_comes_from_the_cameras_and_a_given_one_is_searched_beyond(uns
     assert min(high, 1.4 * middle) < far < 3.3 * middle * 1.4
     assert wide[0] <= 0.5 * low
     assert wide[1] >= 2 * high
+
+
+@torch.no_grad()
+def test_a_given_range_is_not_prolonged_by_the_sky() -> None:
+    """Sky agrees at any large depth, which once made the far end that a hint gives four times as far."""
+    rows = [0, 2, 4, 6]
+    scene = Worlds.variants["outdoor"](4, 14, (64, 128), False)
+    frames = scene.render(rows, 1, samples=1)
+    images = torch.stack([torch.from_numpy(np.asarray(frame.image)) for frame in frames]).permute(0, 3, 1, 2) / 255
+    depth = torch.stack([torch.from_numpy(np.asarray(frame.depth)) for frame in frames])
+    assert (depth == 0).float().mean() > 0.03  # sky
+    near, far = 0.8 * depth[depth > 0].quantile(0.01), 1.4 * depth[depth > 0].quantile(0.99)
+    poses = torch.from_numpy(scene.world_to_camera[rows]).float()
+    views = PosedViews(images, poses, torch.from_numpy(scene.intrinsics).float().repeat(4, 1, 1))
+    network = SweepBackend().network
+    found = network.find_range(network.features(images), views, 3, torch.stack((near, far)).float())
+    assert (found[:, 1] / far).tolist() == pytest.approx([1.0] * 4, rel=0.1)

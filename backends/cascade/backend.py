@@ -1,0 +1,84 @@
+"""The cascade plane sweep as a backend."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from backends.base import Backend
+from backends.cascade.network import CascadeNet
+from backends.cascade.planes import coarse_sources
+from backends.sweep.backend import CONFIDENCE, LICENCE, NO_PARALLAX
+from backends.sweep.network import PosedViews
+from backends.sweep.tokens import DIM, PATCH, TAPS
+from backends.sweep.views import camera_distances
+from backends.weights import Weights
+from vg2gt.geometry.cameras import relative_to_first
+from vg2gt.geometry.precision import full_precision
+from vg2gt.types import Geometry, Hints, Tokens
+
+_STATE = ("context", "context_fine", "swept", "origin")
+
+
+class CascadeBackend(Backend):
+    """Cascade plane-sweep multi-view stereo (needs cameras).
+
+    Every view is matched with other views over all depths from a fraction of the cameras' distance to infinity; what
+    does not match is filled in, and two narrower stages refine the depth. A depth range in the hints is not used.
+    Depth has the unit of the camera translations. ``depth_conf`` is one over the expected relative error of depth.
+
+    Args:
+        pretrained: whether to load weights from ``path``; otherwise random.
+        path: safetensors file with weights.
+        seed: seed of random weights.
+
+    Raises:
+        FileNotFoundError: if the weights cannot be found.
+        ValueError: if they do not fit, or ``path`` is missing.
+    """
+
+    needs_cameras: ClassVar[bool] = True
+
+    def __init__(self, pretrained: bool = True, path: str | None = None, seed: int = 0) -> None:
+        super().__init__("cascade", PATCH, (DIM,) * TAPS, LICENCE, needs_hints=True, predicts_cameras=False)
+        if pretrained and path is None:
+            raise ValueError("backend cascade has no weights in the package: give backend.path=FILE")
+        self.network = Weights(self.name, LICENCE, pretrained, None, None, path, seed).build(CascadeNet)
+        self.freeze()
+
+    @torch.no_grad()
+    def encode(self, images: Tensor, hints: Hints | None = None) -> Tokens:
+        """Matches the views; see :meth:`Backend.encode`. The world frame is that of view 0, in the cameras' unit.
+
+        Raises:
+            ValueError: also if the views have no parallax (one view, or all cameras at the same position).
+        """
+        self.check_images(images)
+        hints = self.require_hints(images, hints, "cameras")
+        assert hints.cameras is not None
+        cameras = relative_to_first(hints.cameras.map(Tensor.double)).map(Tensor.float)
+        encoded = []
+        with full_precision(images):
+            for scene, pictures in enumerate(images.float()):
+                views = PosedViews(pictures, cameras.world_to_camera[scene], cameras.intrinsics[scene])
+                if not (camera_distances(views.world_to_camera) > 0).any():
+                    raise ValueError(NO_PARALLAX)
+                sources = coarse_sources(views.world_to_camera, views.intrinsics, views.size)
+                encoded.append(self.network.encode(self.network.features(pictures), views, sources))
+        taps = [torch.stack([each.taps[tap] for each in encoded]) for tap in range(TAPS)]
+        state = {name: torch.stack([getattr(each, name) for each in encoded]) for name in _STATE}
+        camera = taps[-1].mean(2)  # no camera token, as the network predicts no cameras: use the mean patch token
+        return replace(self.as_tokens(images, taps, camera), state=state | {"cameras": cameras})
+
+    def decode(self, tokens: Tokens) -> Geometry:
+        """Decodes depth and its expected error; see :meth:`Backend.decode`."""
+        scenes, views = tokens.camera.shape[:2]
+        with full_precision(tokens.camera):
+            taps = tuple(tap.float().flatten(0, 1) for tap in tokens.patch)
+            depth, log_scale = self.network.decode(taps, *(tokens.state[name].flatten(0, 1) for name in _STATE))
+            confidence = torch.exp(-log_scale).clamp(*CONFIDENCE)
+        depth, confidence = (each.unflatten(0, (scenes, views)) for each in (depth, confidence))
+        return Geometry(depth, confidence, tokens.state["cameras"], torch.ones_like(depth[:, 0, 0, 0]))

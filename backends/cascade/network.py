@@ -1,0 +1,217 @@
+"""Cascade plane-sweep network: images and cameras to tokens, tokens to depth, without a depth range."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from backends.cascade.features import CascadeFeatures, CascadePyramid
+from backends.cascade.planes import FARTHEST, Planes, baselines, fine_sources
+from backends.cascade.sweep import Matching, Stage
+from backends.sweep.correlate import SourceWarp
+from backends.sweep.features import CONTEXT_COARSE
+from backends.sweep.network import PosedViews
+from backends.sweep.refine import CELLS, DepthHead, PlainBlock, RefineNet, activate, convex_upsample, slices
+from backends.sweep.tokens import DIM, PATCH, POSITION_CHANNELS, TAPS, TokenBlock, patch_places
+from backends.sweep.views import relative_poses
+from backends.sweep.volume import agreement
+from vg2gt.geometry.cameras import resize_intrinsics
+from vg2gt.geometry.precision import full_precision
+
+PLANES = 64
+_SPACING = 1 / (PLANES - 1)
+_QUARTER, _HALF = (16, 0.25 * _SPACING), (8, 0.1 * _SPACING)  # planes and spacing of the later stages
+_CHANNELS = (16, 16, 8)  # of the regularisation of each stage
+_AGREEMENT = (0.1, 0.05)  # widths of the agreement at 1/8 and 1/4
+_BINS = 16  # channels that hold the summed probability of the planes
+_STATED = 1 + 1 + 3 + _BINS  # relative log-depth, mass, agreement, bins
+_SEEN = 32  # channels of the U-Net that the tokens see
+_LOG_DEPTH = 20.0  # maximum absolute log-depth: keeps depth finite for any tokens
+
+
+class CascadeEncoding(NamedTuple):
+    """Intermediate results between images and depth; ``h, w`` is 1/4 of the image size.
+
+    Attributes:
+        taps: patch tokens ``[V, P, DIM]`` of the last blocks.
+        context: ``[V, C, h, w]``.
+        context_fine: ``[V, C, 2 h, 2 w]``.
+        swept: log-depth of the last stage, its probability, that at 1/4 and the share of the matched depth in what the
+            stages are centred on, ``[V, 4, 2 h, 2 w]``.
+        origin: first channels of the last tap, for which decoding adds no direct correction, ``[V, P, 4]``.
+        stages: the three stages, at 1/8, 1/4 and 1/2 of the image.
+        guess: log-depth of the monocular branch at 1/8.
+        centers: log-depth on which each stage but the first is centred, at 1/8 (matched or guessed), 1/4 and 1/2.
+    """
+
+    taps: tuple[Tensor, ...]
+    context: Tensor
+    context_fine: Tensor
+    swept: Tensor
+    origin: Tensor
+    stages: tuple[Stage, ...]
+    guess: Tensor
+    centers: tuple[Tensor, ...]
+
+
+class CascadeNet(nn.Module):
+    """Matches at 1/8 over all depths, fills in what does not match, and matches twice more around that."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.features = CascadePyramid()
+        self.matching = nn.ModuleList(Matching(channels, level == 0) for level, channels in enumerate(_CHANNELS))
+        self.refine = RefineNet(CONTEXT_COARSE + _STATED, 3 + 36 + _SEEN)
+        self.embed = nn.Sequential(
+            nn.Linear(4 * CONTEXT_COARSE + _STATED + 3 + _SEEN, 2 * DIM), nn.GELU(), nn.Linear(2 * DIM, DIM)
+        )
+        self.position = nn.Linear(POSITION_CHANNELS, DIM)
+        self.blocks = nn.ModuleList(TokenBlock(DIM, 4, i % 2 == 1, 2 + 2 * (i % 2)) for i in range(4))
+        self.fill = nn.Linear(DIM, 2)
+        self.begin = nn.Conv2d(CONTEXT_COARSE + 6, 48, 3, 1, 1)
+        self.block = PlainBlock(48)
+        self.end = nn.Conv2d(48, 1 + 36, 3, 1, 1)
+        self.embed_fine = nn.Sequential(nn.Linear(4 * 6 + 16 * 2, 2 * DIM), nn.GELU(), nn.Linear(2 * DIM, DIM))
+        self.head = DepthHead(4)
+        self.gate = nn.Parameter(torch.tensor([-3.0, 4.0, 8.0]))  # bias, mass, mass times greatest agreement
+        for layer in (self.fill, self.end, self.embed_fine[2]):
+            nn.init.zeros_(layer.weight)  # pyright: ignore[reportArgumentType]
+            nn.init.zeros_(layer.bias)  # pyright: ignore[reportArgumentType]
+
+    def encode(
+        self, features: CascadeFeatures, views: PosedViews, sources: Tensor, shown: Tensor | None = None
+    ) -> CascadeEncoding:
+        """Encodes images as tokens.
+
+        Args:
+            features: features of ``views.images``.
+            views: views of one or more scenes.
+            sources: indices of the sources of each view at 1/8 ``[V, n]``.
+            shown: 0 where a view is matched with no source (training), else 1, ``[V, 1, H / 8, W / 8]``.
+        """
+        unit = baselines(views.world_to_camera, views.scenes)
+        planes = Planes(unit)
+        # all depths at 1/8
+        warp = _warp(features.match[0], views, sources, 8)
+        position = torch.linspace(0, 1, PLANES, device=unit.device).view(1, -1, 1, 1).expand(len(unit), -1, -1, -1)
+        first, visible = self.matching[0](features.match[0], position, planes, warp, None, shown)
+        matched = -planes.inverse(first.t).log()
+        agreeing = agreement((-matched).exp().detach(), warp, _AGREEMENT[0])
+        if shown is not None:
+            agreeing = agreeing * shown
+        scale = _scene_scale(matched.detach(), first.mass.detach() * agreeing[:, 1:2], views.scenes)  # [V, 1, 1, 1]
+        # what does not match is filled in: U-Net, then attention
+        bins = slices(first.logits.softmax(1), _BINS)
+        stated = torch.cat((matched - scale, first.mass, agreeing, bins), 1)
+        found = self.refine(torch.cat((F.avg_pool2d(features.context, 2), stated), 1))
+        change, mask, seen = found[:, :3], found[:, 3:39], found[:, 39:]
+        grid = (views.size[0] // PATCH, views.size[1] // PATCH)
+        patches = torch.cat((F.pixel_unshuffle(features.context, 2), stated, change, seen), 1)
+        tokens = self.embed(patches.flatten(2).mT)
+        sure = torch.stack((torch.ones_like(first.mass), first.mass, first.mass * agreeing[:, 1:2]), -1) @ self.gate
+
+        def blend(change: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            """Log-depth, matched or guessed, the guess, and the share of the matched one."""
+            guess = scale + change[:, 1:2]
+            share = torch.sigmoid(sure + change[:, 2:])
+            return share * (matched + 0.1 * change[:, :1]) + (1 - share) * guess, guess, share
+
+        place = self._places(blend(change)[0], scale, views, grid)
+        tokens = self._attend(self.blocks[:2], tokens, place, grid, views.scenes)[-1]
+        filled = F.pad(self.fill(tokens).mT.unflatten(-1, grid), (0, 0, 0, 0, 1, 0))
+        center, guess, share = blend(change + filled)
+        # twice more, around that, with the best sources
+        parallax = relative_poses(views.world_to_camera, sources)[..., :3, 3].norm(dim=-1)  # [V, n]
+        parallax = parallax[..., None] * (-center.detach()).exp().flatten(1)[:, None]
+        chosen = fine_sources(visible.detach().flatten(2), parallax)
+        best = sources.gather(1, chosen)
+        visible = visible.detach().gather(1, chosen[:, :, None, None].expand(-1, -1, *visible.shape[2:]))
+        quarter = convex_upsample(center, mask)
+        warp = _warp(features.match[1], views, best, 4)
+        second, visible = self._narrow(1, quarter, _QUARTER, features, planes, warp, visible)
+        log_depth = -planes.inverse(second.t).log()
+        agreeing = agreement((-log_depth).exp().detach(), warp, _AGREEMENT[1])
+        known = torch.cat((log_depth - scale, second.mass, agreeing, log_depth - quarter), 1)
+        found = self.begin(torch.cat((features.context, known), 1))
+        found = self.end(activate(self.block(found))).float()
+        half = convex_upsample(log_depth + 0.1 * found[:, :1], found[:, 1:])
+        third, _ = self._narrow(2, half, _HALF, features, planes, _warp(features.match[2], views, best, 2), visible)
+        log_depth = -planes.inverse(third.t).log()
+        fine = F.pixel_unshuffle(torch.cat((log_depth - scale, third.mass), 1), 4)
+        tokens = tokens + self.embed_fine(torch.cat((F.pixel_unshuffle(known, 2), fine), 1).flatten(2).mT)
+        place = self._places(F.avg_pool2d(log_depth, 4), scale, views, grid)
+        taps = self._attend(self.blocks[2:], tokens, place, grid, views.scenes)
+        sure = F.interpolate(torch.cat((F.avg_pool2d(second.mass, 2), share), 1), size=log_depth.shape[-2:])
+        swept = torch.cat((log_depth, third.mass, sure), 1)
+        stages, centers = (first, second, third), (center, quarter, half)
+        return CascadeEncoding(
+            tuple(tap.float() for tap in taps[-TAPS:]),
+            features.context,
+            features.context_fine,
+            swept,
+            taps[-1][..., : CELLS**2].float(),
+            stages,
+            guess,
+            centers,
+        )
+
+    def _narrow(
+        self,
+        level: int,
+        center: Tensor,
+        spaced: tuple[int, float],
+        features: CascadeFeatures,
+        planes: Planes,
+        warp: SourceWarp,
+        visible: Tensor,
+    ) -> tuple[Stage, Tensor]:
+        """A stage on planes around the log-depth ``center``; ``visible`` is at half its resolution."""
+        count, spacing = spaced
+        offsets = torch.arange(count, device=center.device).view(1, -1, 1, 1) - (count - 1) / 2
+        position = (planes.position(center.detach()) + spacing * offsets).clamp_min(FARTHEST)
+        visible = F.interpolate(visible, size=center.shape[-2:], mode="nearest")
+        return self.matching[level](features.match[level], position, planes, warp, visible)
+
+    def _attend(
+        self, blocks: nn.ModuleList, tokens: Tensor, place: Tensor, grid: tuple[int, int], scenes: int
+    ) -> list[Tensor]:
+        position = self.position(place)
+        outputs = []
+        for block in blocks:
+            tokens = block(tokens, position, grid, scenes)
+            outputs.append(tokens)
+        return outputs
+
+    def _places(self, log_depth: Tensor, scale: Tensor, views: PosedViews, grid: tuple[int, int]) -> Tensor:
+        """Position encodings of the patches, at the given log-depth, in units of the scene's matched depth."""
+        depth, unit = log_depth.detach().flatten(1).exp(), scale.flatten().exp()
+        with full_precision(depth):
+            cameras = (views.world_to_camera, views.intrinsics)
+            return patch_places(depth, *cameras, torch.stack((unit, unit), 1), grid, views.scenes)
+
+    def decode(
+        self, taps: tuple[Tensor, ...], context: Tensor, context_fine: Tensor, swept: Tensor, origin: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Decodes depth and the log-scale of its relative error, each ``[V, H, W]``; see :class:`DepthHead`."""
+        grid = (context.shape[-2] // 2, context.shape[-1] // 2)
+        log_depth, log_scale = self.head(taps, grid, context, context_fine, swept, origin)
+        return log_depth.clamp(-_LOG_DEPTH, _LOG_DEPTH).exp(), log_scale
+
+
+def _scene_scale(log_depth: Tensor, weight: Tensor, scenes: int) -> Tensor:
+    """Weighted median of the log-depth of each scene, ``[V, 1, 1, 1]``."""
+    views = len(log_depth) // scenes
+    values, order = log_depth.reshape(scenes, -1).sort(1)
+    mass = (weight.reshape(scenes, -1) + 1e-4).gather(1, order).cumsum(1)
+    middle = (mass < 0.5 * mass[:, -1:]).sum(1, keepdim=True)
+    return values.gather(1, middle).repeat_interleave(views, 0).view(-1, 1, 1, 1)
+
+
+def _warp(maps: Tensor, views: PosedViews, sources: Tensor, stride: int) -> SourceWarp:
+    """Correspondences of feature maps at ``1 / stride`` of the images, in full precision (half is off by pixels)."""
+    with full_precision(maps):
+        intrinsics = resize_intrinsics(views.intrinsics, 1 / stride, 1 / stride)
+        return SourceWarp(views.world_to_camera, intrinsics, sources, (maps.shape[-2], maps.shape[-1]))

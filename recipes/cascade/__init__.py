@@ -1,0 +1,1 @@
+"""Recipe for the weights of the cascade plane sweep: samples, objective and training."""

@@ -1,0 +1,144 @@
+"""Trains the cascade: ``python -m recipes.cascade [key=value ...]``; options in ``train.yaml``.
+
+Training has no planned end: the rate is constant, and the weights to use are a moving average. It continues from
+``OUT/state.safetensors`` if that exists, else from ``begin``; with ``cooldown`` steps the rate falls to zero, and only
+the weights are written.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+# oneDNN compiles convolutions per shape; its default cache of 1024 is too small for one step of each shape.
+os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "20000")
+
+import hydra
+import torch
+from omegaconf import DictConfig, OmegaConf
+from safetensors import safe_open
+from safetensors.torch import load_file, save
+from torch import Tensor
+
+from backends.cascade.network import CascadeNet
+from backends.sweep.network import PosedViews
+from recipes.cascade.objective import objective
+from recipes.cascade.samples import CascadeSamples, Sample
+from recipes.sweep.scenes import scene_files
+from vg2gt.io.files import write_bytes
+
+_LARGEST_GRADIENT = 1.0
+_AVERAGED = "averaged."
+STATE, WEIGHTS = "state.safetensors", "cascade.safetensors"
+
+
+class Training:
+    """The network, the moving average of its weights, the optimizer, and how far training has come.
+
+    Args:
+        options: ``training`` in ``train.yaml``.
+        state: file to continue from; None for random weights.
+    """
+
+    def __init__(self, options: DictConfig, state: Path | None = None) -> None:
+        self.options, self.step, self.seconds, self.here = options, 0, 0.0, 0
+        self.net: Any = CascadeNet().to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+        self.averaged = {name: value.detach().clone().float() for name, value in self.net.state_dict().items()}
+        if state:
+            with safe_open(state, "pt") as file:
+                metadata = file.metadata()
+            self.step, self.seconds = int(metadata.get("step", 0)), float(metadata.get("seconds", 0))
+            tensors = load_file(state)
+            own = {name: value for name, value in tensors.items() if not name.startswith(_AVERAGED)}
+            self.net.load_state_dict(own)
+            self.averaged = {name: tensors.get(_AVERAGED + name, own[name]).float() for name in own}
+        decayed = [p for p in self.net.parameters() if p.dim() > 1]
+        rest = [p for p in self.net.parameters() if p.dim() <= 1]
+        groups = [{"params": decayed, "weight_decay": options.weight_decay}, {"params": rest, "weight_decay": 0.0}]
+        self.optimizer = torch.optim.AdamW(groups, lr=options.rate, betas=(0.9, 0.98), fused=True)
+
+    def update(self, sample: Sample, factor: float = 1.0) -> dict[str, float]:
+        """One step on one sample, with ``factor`` on the rate; returns the terms of the objective.
+
+        Raises:
+            RuntimeError: if the objective or a gradient is not finite.
+        """
+        start = time.process_time()
+        for group in self.optimizer.param_groups:
+            # the optimizer remembers some 50 steps: its state is not kept, but found again while the rate rises
+            group["lr"] = self.options.rate * factor * min(1.0, (self.here + 1) / self.options.warmup)
+        images = sample.images.contiguous(memory_format=torch.channels_last)
+        views = PosedViews(images, sample.world_to_camera, sample.intrinsics)
+        encoding = self.net.encode(self.net.features(images), views, sample.sources, sample.shown)
+        taps: tuple[Tensor, ...] = encoding.taps
+        if self.options.token_noise and self.step % 2:
+            noise = torch.Generator().manual_seed(self.step)
+            taps = tuple(tap + self.options.token_noise * torch.randn(tap.shape, generator=noise) for tap in taps)
+        decoded = self.net.decode(taps, encoding.context, encoding.context_fine, encoding.swept, encoding.origin)
+        loss, terms = objective(encoding, *decoded, sample)
+        if not torch.isfinite(loss):
+            raise RuntimeError(f"the objective is {float(loss)} at step {self.step}: {terms}")
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.net.parameters(), _LARGEST_GRADIENT, error_if_nonfinite=True)
+        self.optimizer.step()
+        # shorter at the beginning, so that the first weights are forgotten
+        keep = min(self.options.average, (self.step + 1) / (self.step + 5))
+        for name, value in self.net.state_dict().items():
+            self.averaged[name].lerp_(value.float(), 1 - keep)
+        self.step, self.here = self.step + 1, self.here + 1
+        self.seconds += time.process_time() - start
+        return {"loss": float(loss.detach())} | {name: float(term.detach()) for name, term in terms.items()}
+
+    def write(self, out: Path, config: DictConfig, state: bool = True) -> None:
+        """Writes the averaged weights and, with ``state``, what training continues from, in half precision."""
+        made_of = {"step": str(self.step), "seconds": f"{self.seconds:.0f}", "options": OmegaConf.to_yaml(config)}
+        averaged = {name: value.half().contiguous() for name, value in self.averaged.items()}
+        write_bytes(out / WEIGHTS, save(averaged, metadata=made_of))
+        if state:
+            own = {name: value.detach().half().contiguous() for name, value in self.net.state_dict().items()}
+            own |= {_AVERAGED + name: value for name, value in averaged.items()}
+            write_bytes(out / STATE, save(own, metadata=made_of))
+
+
+@hydra.main(config_path=".", config_name="train", version_base="1.3")
+def main(config: DictConfig) -> None:
+    """Trains for ``minutes``, or until the process is told to stop."""
+    torch.set_num_threads(config.threads)
+    torch.manual_seed(config.seed)
+    out = Path(config.out)
+    out.mkdir(parents=True, exist_ok=True)
+    begun = out / STATE if (out / STATE).is_file() else Path(config.begin) if config.begin else None
+    training = Training(config.training, begun)
+    files = [file for part in config.scenes.parts for file in scene_files(config.scenes.folder, **part)]
+    files = [file for file in files if file.is_file()] if config.scenes.rendered else files
+    rooms = sorted(Path(config.infinigen.folder).glob("room_*.npz")) if config.infinigen.folder else []
+    samples = CascadeSamples(files, config.seed, rooms, config.infinigen.share, **config.samples)
+    print(f"step {training.step}, {len(files)} scenes, {len(rooms)} rooms, begun with {begun}", flush=True)
+    told: list[int] = []
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *given: told.append(given[0]))
+    start = written = time.monotonic()
+    mean: dict[str, float] = {}
+    first, last = training.step, training.step + config.cooldown if config.cooldown else None
+    while not told and (config.cooldown or not config.minutes or time.monotonic() - start < 60 * config.minutes):
+        if training.step == last:
+            break
+        factor = 1.0 if last is None else (last - training.step) / config.cooldown
+        terms = training.update(samples[training.step], factor)
+        mean = {name: mean.get(name, term) + 0.02 * (term - mean.get(name, term)) for name, term in terms.items()}
+        if training.step % 50 == 0:
+            shown = " ".join(f"{name} {value:.4f}" for name, value in mean.items())
+            rate = (time.monotonic() - start) / (training.step - first)
+            print(f"{training.step} {rate:.2f} s/step {training.seconds / 3600:.2f} h {shown}", flush=True)
+        if not config.cooldown and time.monotonic() - written > 60 * config.save_minutes:
+            training.write(out, config)
+            written = time.monotonic()
+    training.write(out / "cooled" if config.cooldown else out, config, not config.cooldown)
+
+
+if __name__ == "__main__":
+    main()

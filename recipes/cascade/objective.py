@@ -1,0 +1,102 @@
+"""Training objective of the cascade: log-depth of every stage, cross-entropy of planes, edges and uncertainty."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from backends.cascade.network import PLANES, CascadeEncoding
+from backends.cascade.planes import Planes, baselines
+from backends.cascade.sweep import Stage
+from recipes.cascade.samples import Sample
+from recipes.sweep.objective import cell_inverse
+
+_CLAMP = 2.0  # log-depth errors are clamped to this
+_BEYOND = 1.5 / (PLANES - 1)  # position from which on any greater depth counts as correct, as for sky
+_ROOM = 1.0  # up to this much log-depth farther, so that depth does not diverge
+_BEYOND_ERROR = 0.7  # minimum relative error that the uncertainty of such pixels is trained on
+WEIGHTS = {
+    "depth": 2.0,
+    "uncertainty": 0.15,
+    "gradient": 1.0,
+    "planes": 0.3,
+    "stages": 0.5,
+    "centers": 0.5,
+    "guess": 0.3,
+}
+
+
+def objective(
+    encoding: CascadeEncoding, depth: Tensor, log_scale: Tensor, sample: Sample
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Computes the training objective.
+
+    Args:
+        encoding: encoding of the sample's images.
+        depth: decoded depth ``[V, H, W]``.
+        log_scale: log-scale of its relative error ``[V, H, W]``.
+        sample: ground-truth depth (0 is unknown, infinity is sky) and weights of the pixels.
+
+    Returns:
+        The weighted sum, and its unweighted terms.
+    """
+    planes = Planes(baselines(sample.world_to_camera))
+    farthest = planes.inverse(torch.full_like(sample.depth[:, None, :1, :1], _BEYOND)).reciprocal()  # [V, 1, 1, 1]
+    known = (sample.depth > 0).float()
+    error, beyond = _log_error(depth.log()[:, None], sample.depth[:, None], farthest)
+    error, beyond = error[:, 0], beyond[:, 0]
+    stated = torch.where(beyond, error.abs().clamp_min(_BEYOND_ERROR), error.abs()).clamp_max(_CLAMP)
+    valid = known * ~beyond
+    log_scale = log_scale.clamp(-6, 1)
+    terms = {
+        "depth": _mean(error.abs().clamp_max(_CLAMP), known * sample.weight),
+        "uncertainty": _mean(stated * torch.exp(-log_scale) + log_scale, known),
+        "gradient": sum((_gradient(error[:, ::k, ::k], valid[:, ::k, ::k]) for k in (1, 2, 4)), torch.zeros(())),
+    }
+    sums: dict[str, list[Tensor]] = {"planes": [], "stages": [], "centers": [], "guess": []}
+    for stage, center, cell in zip(encoding.stages, encoding.centers, (8, 4, 2), strict=True):
+        inverse, seen = cell_inverse(sample.depth, cell)
+        weight = seen * F.avg_pool2d(sample.weight[:, None], cell)
+        truth = inverse.clamp_min(1e-9).reciprocal()
+        found = -planes.inverse(stage.t).log()
+        sums["planes"].append(_cross_entropy(stage, planes.position(truth.log()), seen))
+        looked = {"stages": found, "centers": center} | ({"guess": encoding.guess} if cell == 8 else {})
+        for name, log_depth in looked.items():
+            off = _log_error(log_depth, truth, farthest)[0].abs().clamp_max(_CLAMP)
+            sums[name].append(_mean(off, seen if name == "stages" else weight))
+    terms |= {name: torch.stack(values).sum() for name, values in sums.items()}
+    return torch.stack([WEIGHTS[name] * term for name, term in terms.items()]).sum(), terms
+
+
+def _log_error(log_depth: Tensor, truth: Tensor, farthest: Tensor) -> tuple[Tensor, Tensor]:
+    """Error of log-depth, and whether the truth is beyond the farthest plane, where it only has to be far enough."""
+    beyond = truth > farthest
+    truth = torch.where(beyond | (truth <= 0), farthest, truth)
+    error = log_depth - truth.log()
+    outside = error.clamp_max(0) + (error - _ROOM).clamp_min(0)
+    return torch.where(beyond, outside, error), beyond
+
+
+def _mean(values: Tensor, weights: Tensor) -> Tensor:
+    return (values * weights).sum() / weights.sum().clamp_min(1)
+
+
+def _gradient(error: Tensor, valid: Tensor) -> Tensor:
+    """Mean absolute difference between the errors of neighbouring pixels; invariant to the scale of depth."""
+    down = (error[:, 1:] - error[:, :-1]).abs().clamp_max(1) * valid[:, 1:] * valid[:, :-1]
+    right = (error[:, :, 1:] - error[:, :, :-1]).abs().clamp_max(1) * valid[:, :, 1:] * valid[:, :, :-1]
+    return down.mean() + right.mean()
+
+
+def _cross_entropy(stage: Stage, t: Tensor, known: Tensor) -> Tensor:
+    """Cross-entropy of the planes; the target ``t [V, 1, h, w]`` is split linearly between its two nearest planes."""
+    count = stage.position.shape[1]
+    spacing = stage.position[:, -1:] - stage.position[:, -2:-1]
+    place = count - 1 - (stage.position[:, -1:] - t) / spacing
+    known = known * (place >= 0) * (place <= count - 1)
+    low = place.floor().clamp(0, count - 2)
+    share = (place - low).clamp(0, 1)
+    likely, low = F.log_softmax(stage.logits, 1), low.long()
+    entropy = -(likely.gather(1, low) * (1 - share) + likely.gather(1, low + 1) * share)
+    return _mean(entropy, known)

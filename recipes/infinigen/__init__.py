@@ -1,0 +1,1 @@
+"""Recipe for furnished rooms made with Infinigen."""

@@ -1,0 +1,186 @@
+"""The recipe of the cascade's weights, and slim rooms."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+from safetensors import safe_open
+from safetensors.torch import load_file
+
+from backends.cascade import CascadeBackend
+from backends.cascade.network import CascadeEncoding, CascadeNet
+from backends.cascade.planes import Planes, baselines
+from backends.cascade.sweep import Stage
+from backends.sweep.backend import SHIPPED
+from recipes.cascade.__main__ import STATE, WEIGHTS, Training
+from recipes.cascade.begin import begin
+from recipes.cascade.objective import objective
+from recipes.cascade.samples import CascadeSamples, Sample
+from recipes.infinigen.slim import VIEWS, choose, decode_depth, encode_depth, read_slim, write_slim
+from recipes.sweep.objective import cell_inverse
+from recipes.sweep.scenes import read_scene, scene_files
+from tests.data.sources import layout_infinigen
+from tests.data.sources.layouts import room
+
+SHAPES = [(2, 48, 96, 0.5), (12, 32, 64, 0.5)]
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    return scene_files(tmp_path_factory.mktemp("scenes"), 2, 5_000_000, (64, 128))
+
+
+def test_samples_depend_on_their_number_alone(scenes: list[Path]) -> None:
+    """From 2 to 12 views; sources are other views; what is hidden or seen by one view only weighs more."""
+    samples, again = (CascadeSamples(scenes, 0, shapes=SHAPES) for _ in range(2))
+    drawn = [samples[n] for n in range(24)]
+    assert all(torch.equal(a, b) for a, b in zip(drawn[7], again[7], strict=True))
+    assert {len(sample.images) for sample in drawn} == {2, 12}
+    for sample in drawn:
+        own = torch.arange(len(sample.images))[:, None]
+        assert ((sample.sources != own) & (sample.sources >= 0) & (sample.sources < len(own))).all()
+        hidden = (sample.shown[:, 0] == 0).repeat_interleave(8, 1).repeat_interleave(8, 2)
+        assert (sample.weight[hidden] == 2).all()
+        assert sample.weight.min() >= 1
+    orphaned = [sample for sample in drawn if not sample.shown.all()]
+    assert 1 <= len(orphaned) <= 10
+    plain = CascadeSamples(scenes, 0, shapes=SHAPES, plain=True)
+    assert all(plain[n].shown.all() for n in range(6))
+
+
+@pytest.fixture
+def slope() -> tuple[Sample, CascadeEncoding]:
+    """A slanted plane in two views, and stages that find it exactly."""
+    rows, columns = torch.arange(32.0)[:, None], torch.arange(32.0)
+    depth = (1 / (0.2 + 0.004 * columns + 0.006 * rows)).expand(2, -1, -1)
+    poses = torch.eye(4).repeat(2, 1, 1)
+    poses[1, 0, 3] = 0.5
+    ones = torch.ones(2, 32, 32)
+    sample = Sample(torch.zeros(2, 3, 32, 32), depth, poses, torch.eye(3), torch.zeros(2, 1), ones, ones)
+    planes, stages, centers = Planes(baselines(poses)), [], []
+    for cell, count, spacing in ((8, 64, 1 / 63), (4, 16, 0.25 / 63), (2, 8, 0.1 / 63)):
+        truth = -cell_inverse(depth, cell)[0].log()
+        t = planes.position(truth)
+        position = torch.arange(count).view(1, -1, 1, 1) * spacing
+        if cell < 8:
+            position = t + position - position.mean()
+        share = (1 - (position - t).abs() / spacing).clamp_min(1e-6)
+        stages.append(Stage(share.log(), position.expand(2, -1, -1, -1), t, torch.ones_like(t)))
+        centers.append(truth)
+    nothing = torch.zeros(())
+    swept = torch.cat((centers[2],) * 4, 1)
+    found = CascadeEncoding((), nothing, nothing, swept, nothing, tuple(stages), centers[0], tuple(centers))
+    return sample, found
+
+
+def test_the_objective_is_lowest_at_the_truth(slope) -> None:
+    sample, found = slope
+    unsure = torch.full_like(sample.depth, -3.0)
+    best = objective(found, sample.depth, unsure, sample)[1]
+    assert all(float(best[name]) < 1e-4 for name in ("depth", "gradient", "stages", "centers", "guess"))
+
+    def worse(term: str, encoding: CascadeEncoding = found, decoded: torch.Tensor = sample.depth) -> bool:
+        return float(objective(encoding, decoded, unsure, sample)[1][term]) > float(best[term]) + 1e-3
+
+    assert worse("depth", decoded=1.1 * sample.depth)
+    assert not worse("gradient", decoded=1.1 * sample.depth)  # the shape is right
+    assert worse("guess", found._replace(guess=found.guess + 0.1))
+    for level in range(3):
+        centers, stages = list(found.centers), list(found.stages)
+        centers[level] = centers[level] + 0.1
+        assert worse("centers", found._replace(centers=tuple(centers)))
+        stage = stages[level]
+        for step in (1, -1):
+            stages[level] = stage._replace(logits=stage.logits.roll(step, 1))
+            assert worse("planes", found._replace(stages=tuple(stages)))
+        stages[level] = stage._replace(t=stage.t + 0.01)
+        assert worse("stages", found._replace(stages=tuple(stages)))
+
+
+def test_sky_only_has_to_be_far(slope) -> None:
+    sample, found = slope
+    unsure = torch.full_like(sample.depth, -0.3)
+    sky = sample._replace(depth=torch.full_like(sample.depth, torch.inf))
+    depths = (10.0, 100.0, 200.0, 300.0, 2000.0)  # of a baseline of 0.5, sky begins at 280 baselines
+    near, less, far, farther, away = (
+        float(objective(found, torch.full_like(sample.depth, d), unsure, sky)[1]["depth"]) for d in depths
+    )
+    assert near > less > 0.2
+    assert far == farther == 0 < away
+    assert torch.isfinite(objective(found, sample.depth, unsure, sky)[0])
+
+
+def test_training_continues_from_its_state(scenes: list[Path], tmp_path: Path) -> None:
+    """Step, time, weights and their average come back (in half precision), and the average is a backend's weights."""
+    config = OmegaConf.create(
+        {"training": {"rate": 1e-3, "weight_decay": 0.02, "warmup": 2, "average": 0.5, "token_noise": 0.3}}
+    )
+    torch.manual_seed(0)
+    training, samples = Training(config.training), CascadeSamples(scenes, 0, shapes=SHAPES[:1])
+    before = {name: value.clone() for name, value in training.net.state_dict().items()}
+    terms = [training.update(samples[n]) for n in range(2)]
+    assert all(np.isfinite(list(each.values())).all() for each in terms)
+    training.write(tmp_path, config)
+    again = Training(config.training, tmp_path / STATE)
+    assert (again.step, again.here) == (2, 0)
+    assert again.seconds == pytest.approx(training.seconds, abs=1)
+    for name, value in training.net.state_dict().items():
+        torch.testing.assert_close(again.net.state_dict()[name], value, rtol=1e-3, atol=1e-6)
+        torch.testing.assert_close(again.averaged[name], training.averaged[name], rtol=1e-3, atol=1e-6)
+    assert sum(not torch.equal(before[name], value) for name, value in training.net.state_dict().items()) > 100
+    assert again.update(samples[2])["loss"] == pytest.approx(training.update(samples[2])["loss"], rel=0.05)
+    CascadeBackend(path=str(tmp_path / WEIGHTS))
+    kept = (tmp_path / STATE).read_bytes()
+    training.write(tmp_path / "cooled", config, state=False)
+    assert (tmp_path / STATE).read_bytes() == kept
+    assert [path.name for path in (tmp_path / "cooled").iterdir()] == [WEIGHTS]
+    with safe_open(tmp_path / STATE, "pt") as file:
+        assert "rate: 0.001" in file.metadata()["options"]
+
+
+def test_training_begins_with_the_plane_sweep() -> None:
+    """Layers of the same meaning are copied; the columns of inputs too, wherever they moved."""
+    torch.manual_seed(0)
+    net = CascadeNet()
+    assert begin(net, SHIPPED) > 3_000_000
+    old, new = load_file(SHIPPED), net.state_dict()
+    torch.testing.assert_close(new["features.coarse.weight"], old["features.coarse.weight"].float())
+    torch.testing.assert_close(new["matching.0.volume.begin.weight"], old["volume.begin.weight"].float())
+    torch.testing.assert_close(new["refine.end.weight"][3:39], old["refine.end.weight"][1:].float())
+    torch.testing.assert_close(new["refine.begin.0.weight"][:, :48], old["refine.begin.0.weight"][:, :48].float())
+    torch.testing.assert_close(new["refine.begin.0.weight"][:, -20:], old["refine.begin.0.weight"][:, -20:].float())
+
+
+def test_depth_of_slim_rooms_is_exact_to_a_tenth_of_a_percent() -> None:
+    depth = np.array([0.03, 0.5, 2.0, 11.0, 90.0, np.inf])
+    found = decode_depth(encode_depth(depth))
+    assert np.isinf(found[-1])
+    np.testing.assert_allclose(found[:-1], depth[:-1], rtol=1.2e-3)
+    paths = [f"{kind}_{n // 12}" for kind in ("walk", "turn", "orbit_far", "near", "far") for n in range(12)]
+    chosen = choose(paths)
+    assert len(chosen) == len(set(chosen)) == VIEWS
+    assert not any(paths[row].startswith("turn") for row in chosen)
+
+
+def test_a_slim_room_is_read_as_it_was_written(tmp_path: Path) -> None:
+    truth = room()
+    count = len(truth.images)
+    layout_infinigen.write(tmp_path / "room_0001", truth, [f"0_0_{n:04d}_0" for n in range(count)], 1)
+    (tmp_path / "room_0001/views.json").write_text(json.dumps([{"path": "walk_0"}] * count))
+    (tmp_path / "room_0001/check.json").write_text('{"seed": 1, "kind": "LivingRoom"}')
+    (tmp_path / "slim").mkdir()
+    write_slim(tmp_path / "room_0001", tmp_path / "slim/room_0001.npz")
+    scene = read_scene(tmp_path / "slim/room_0001.npz")
+    arrays = read_slim(tmp_path / "slim/room_0001.npz")
+    assert scene.images.shape == (count, *truth.images.shape[-2:], 3)
+    assert arrays["images"].dtype == np.uint8
+    difference = scene.images.permute(0, 3, 1, 2).float() / 255 - truth.images
+    assert difference.abs().mean() < 0.03
+    shown = truth.depth > 0
+    torch.testing.assert_close(scene.depth[shown], truth.depth[shown], rtol=1.2e-3, atol=0)
+    assert scene.depth[~shown].isinf().all()
+    torch.testing.assert_close(scene.world_to_camera, truth.world_to_camera.float(), rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(scene.intrinsics, truth.intrinsics.float(), rtol=1e-4, atol=1e-4)
