@@ -2,6 +2,7 @@
 
 import threading
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ from vg2gt.rendering import cpu_tiles, render
 from vg2gt.rendering.cpu import tiles
 from vg2gt.rendering.options import DepthKind, Mode
 from vg2gt.rendering.renderer import Implementation
+from vg2gt.types import Gaussians
 
 FIELDS = (*PARAMETERS, "batch")
 
@@ -170,3 +172,37 @@ def test_equal_depths_keep_their_order(dtype: type[np.floating], count: int) -> 
     order = tiles.depth_order(depths)
     assert order.tolist() == sorted(range(count), key=lambda i: (depths[i], i))
     assert count < 2 or len(set(depths.tolist())) < count
+
+
+def test_the_forward_pass_notes_the_blocks_that_each_gaussian_changes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not all of a diagonal Gaussian's box, and none behind opaque Gaussians: the backward pass visits no others."""
+    noted: list[Any] = []
+    prepare = cpu_tiles._prepare
+    monkeypatch.setattr(cpu_tiles, "_prepare", lambda *given: noted.append(prepare(*given)) or noted[-1])
+    diagonal = Gaussians(
+        means=torch.tensor([[0.0, 0, 3]]),
+        quats=torch.tensor([[0.924, 0, 0, 0.383]]),
+        scales=torch.tensor([[0.02, 0.3, 0.02]]),
+        opacities=torch.tensor([0.9]),
+        sh=torch.zeros(1, 1, 3),
+        batch=torch.zeros(1, dtype=torch.int64),
+    )
+    cameras = floats_to(pinhole((32, 32)), torch.float32)
+    alpha = render(diagonal, cameras, implementation="cpu").alpha[0, 0]
+    touched = alpha.view(8, 4, 8, 4).amax((1, 3)).numpy() > 0
+    bits = np.zeros((8, 8), bool)
+    for tile in range(4):
+        for visit in noted[0].visits[noted[0].starts[tile] : noted[0].starts[tile + 1]]:
+            blocks = int(visit) >> np.arange(16).reshape(4, 4) & 1
+            bits[tile // 2 * 4 :, tile % 2 * 4 :][:4, :4] |= blocks > 0
+    assert (bits == touched).all()
+    x0, x1, y0, y1 = noted[0].boxes[0]
+    assert 5 < touched.sum() < 0.7 * (-(-x1 // 4) - x0 // 4) * (-(-y1 // 4) - y0 // 4)
+
+    wide = torch.tensor([[50.0, 50, 0.01]])
+    opaque = replace(diagonal, means=diagonal.means - 1, scales=wide, opacities=torch.ones(1))
+    render(opaque.joined(opaque).joined(diagonal), cameras, implementation="cpu")  # the second one stops all rays
+    behind = noted[1].members == 2
+    assert behind.any()
+    assert noted[1].visits[~behind].all()
+    assert not noted[1].visits[behind].any()

@@ -49,6 +49,7 @@ class _Lists:
     starts: np.ndarray
     members: np.ndarray
     places: np.ndarray
+    visits: np.ndarray  # of every entry: bit mask of the blocks that it changes, written by the forward pass
 
 
 @dataclass(frozen=True)
@@ -169,7 +170,7 @@ def _prepare(view: _View, options: RenderOptions) -> _Lists:
     count_tiles(boxes, view.across, counts, offsets, starts)
     members, places = np.empty(starts[-1], np.int32), np.empty(starts[-1], np.int64)
     fill_tiles(boxes, visible, view.across, offsets, starts[:-1].copy(), members, places)
-    return _Lists(records, boxes, counts, offsets, starts, members, places)
+    return _Lists(records, boxes, counts, offsets, starts, members, places, np.zeros(len(members), np.uint16))
 
 
 def _parameters(options: RenderOptions, dtype: np.dtype) -> np.ndarray:
@@ -190,7 +191,7 @@ def _scratch(dtype: np.dtype) -> SimpleNamespace:
             hits=_aligned(tiles.BLOCKS * HIT_CAPACITY * tiles.HIT_SIZE, dtype),
             counts=np.zeros(tiles.BLOCKS, np.int64),
             staged=np.zeros((tiles.STAGED, tiles.RECORD + 3), dtype),
-            spans=np.zeros((tiles.STAGED, 4), np.int64),
+            touched=np.zeros(tiles.STAGED, np.int64),
             total=np.empty(16, np.float64),
             work=np.ones(FIELDS * CHUNK, np.float64),
             indices=np.empty(CHUNK, np.int64),
@@ -219,9 +220,9 @@ def _forward(view: _View, lists: _Lists, options: RenderOptions, *outputs: np.nd
         hits, (first, last) = scratch.hits, tile_range
         while first < last:
             first = render_tiles(
-                lists.records, lists.boxes, view.colors, lists.members, lists.starts, (first, last),
+                lists.records, lists.boxes, view.colors, lists.members, lists.visits, lists.starts, (first, last),
                 options.depth == "expected", steps, newton, parameters, view.background,
-                scratch.state, hits, scratch.counts, scratch.staged, scratch.spans, *outputs,
+                scratch.state, hits, scratch.counts, scratch.staged, scratch.touched, *outputs,
             )  # fmt: skip
             if first < last:
                 hits = _aligned(tiles.BLOCKS * (int(scratch.counts.max()) + 1) * tiles.HIT_SIZE, view.means.dtype)
@@ -250,8 +251,8 @@ def _backward(
     def rasterize(tile_range: tuple[int, int]) -> None:
         scratch = _scratch(view.means.dtype)
         visit_tiles(
-            lists.records, lists.boxes, view.colors, lists.members, lists.places, lists.starts, tile_range, parameters,
-            scratch.state, scratch.sums, scratch.staged, scratch.spans, *[*planes, rows],
+            lists.records, view.colors, lists.members, lists.visits, lists.places, lists.starts, tile_range, parameters,
+            scratch.state, scratch.sums, scratch.staged, *[*planes, rows],
         )  # fmt: skip
 
     parallel_for(view.tile_ranges, rasterize)

@@ -17,15 +17,15 @@ from vg2gt.rendering.constants import FAST, HALF, ONE, SUMS, TWO, ZERO
 from vg2gt.rendering.cpu import planes
 from vg2gt.rendering.cpu.tiles import (
     BLOCKS_ACROSS,
-    COLUMN,
+    LANE_X,
+    LANE_Y,
     LANES,
     ROW,
-    ROW_BITS,
     SIDE,
     STAGED,
     TILE,
-    alive_blocks,
     attenuate,
+    lowest_bit,
     place_of,
     respond,
     stage,
@@ -108,123 +108,111 @@ def _make_backward_tile(geometry: bool, solid: bool) -> Callable[..., None]:
     """Compiles the backward pass of one tile; ``geometry`` (depth and normals) and ``solid`` are constants in it."""
 
     @kernel_part(fastmath=FAST, error_model="numpy")
-    def backward_tile(
-        records, colors, boxes, members, places, x_tile, y_tile, parameters, state, sums, staged, spans, rows
-    ):
+    def backward_tile(records, colors, members, visits, places, x_tile, y_tile, parameters, state, sums, staged, rows):
         """Visits a tile's Gaussians front to back again and writes the gradient row of each, at its ``places``."""
         alpha_max, stop = parameters[0], parameters[1]
-        alive = 0
-        visited = len(members)
         for p in range(len(members)):
             j = p % STAGED
             if j == 0:
-                alive = alive_blocks(state)
-                if not alive:
-                    visited = p
-                    break
-                stage(records, colors, boxes, members[p : p + STAGED], x_tile, y_tile, staged, spans)
+                stage(records, colors, members[p : p + STAGED], staged)
                 for q in range(p, min(p + STAGED, len(members))):  # zeroes their rows, which also prefetches them
                     row = rows[places[q]]
                     for i in range(ROW):
                         row[i] = ZERO
+            blocks = np.int64(visits[p])
+            if blocks == 0:
+                continue
             g = staged[j]
             uc, vc, qa, qb, qc, q0, q1, z = g[0], g[1], g[2], g[3], g[4], g[5], g[6], g[7]
             a0, eps, opacity, cutoff = g[8], g[9], g[10], g[11]
             n0, n1, n2 = g[12], g[13], g[14]
             c0, c1, c2 = g[16], g[17], g[18]
-            sums[:] = ZERO
-            for block_row in range(spans[j, 2], spans[j, 3]):
-                top = np.float32(y_tile + block_row * SIDE) - vc
-                for block_column in range(spans[j, 0], spans[j, 1]):
-                    block = block_row * BLOCKS_ACROSS + block_column
-                    if not alive >> block & 1:
-                        continue
-                    left = np.float32(x_tile + block_column * SIDE) - uc
-                    base = np.uintp(block * LANES)
-                    for lane in range(LANES):
-                        v = np.uintp(lane)
-                        k = base + v
-                        # response and alpha, as in the forward pass
-                        dx = left + np.float32(np.int32(lane) & COLUMN)
-                        dy = top + np.float32(np.int32(lane) >> ROW_BITS)
-                        before = state[k]
-                        s_row, e_row, f_row = ONE + q1 * dy, qc * dy * dy, TWO * qb * dy
-                        e, s, r, on = respond(dx, before, (qa, q0, eps, cutoff), s_row, e_row, f_row)
-                        r = r if on else ONE
-                        inverse = ONE / r
-                        exponent = -HALF * e * inverse
-                        alpha, after, state[k] = attenuate(exponent, on, before, opacity, alpha_max, stop)
-                        kept = alpha > ZERO
-                        weight = alpha * before
-                        # gradient of alpha: this Gaussian's value against everything behind it
-                        g0, g1, g2 = state[k + planes.G0], state[k + planes.G1], state[k + planes.G2]
-                        value = g0 * c0 + g1 * c1 + g2 * c2
-                        if geometry:
-                            peak, precision = z * s * inverse, a0 * r
-                            g3, g4, g5 = state[k + planes.G3], state[k + planes.G4], state[k + planes.G5]
-                            value = value + g3 * n0 + g4 * n1 + g5 * n2
-                            if not solid:
-                                toward = state[k + planes.GE]
-                                value = value + toward * peak
-                        rest = state[k + planes.REST] - weight * (value if kept else ZERO)
-                        state[k + planes.REST] = rest
-                        free = ONE / (ONE - alpha)
-                        slack = before * value - rest * free
-                        gt = gp = ZERO
-                        if geometry and solid:
-                            # implicit gradient of the median (paper, eqn tmed_grad), scaled by kd = incoming / S
-                            kd = state[k + planes.KD]
-                            d = state[k + planes.DEPTH] - peak
-                            bell = exp(-HALF * precision * d * d)
-                            gauss = alpha * bell
-                            half = HALF * kd / (ONE - gauss)
-                            behind = d > ZERO
-                            lifted, blocked = half * bell, kd * free
-                            slack += lifted - blocked if behind else -lifted
-                            pull = half * gauss * abs(d)
-                            gt = pull * precision if kept else ZERO
-                            gp = -HALF * pull * d if kept else ZERO
-                        elif geometry:
-                            crossing = (before > HALF) & (after <= HALF)
-                            gt = weight * toward + (state[k + planes.GM] if crossing else ZERO)
-                            gt = gt if kept else ZERO
-                        # chain rule to the response, then sums over the block
-                        ga = slack * alpha if (kept & (alpha < alpha_max)) else ZERO
-                        gd = -HALF * ga
-                        gr = -gd * e * inverse * inverse
-                        if geometry:
-                            gr = gr - gt * peak * inverse + gp * a0
-                        ge = gd * inverse + gr * eps
-                        gs = gt * z * inverse + TWO * gr * s if geometry else TWO * gr * s
-                        gex, gey = ge * dx, ge * dy
-                        sums[planes.AX + v] += gex
-                        sums[planes.AY + v] += gey
-                        sums[planes.AXX + v] += gex * dx
-                        sums[planes.AXY + v] += gex * dy
-                        sums[planes.AYY + v] += gey * dy
-                        sums[planes.B + v] += gs
-                        sums[planes.BX + v] += gs * dx
-                        sums[planes.BY + v] += gs * dy
-                        sums[planes.GR + v] += gr * e
-                        sums[planes.GO + v] += ga
-                        sums[planes.K0 + v] += weight * g0
-                        sums[planes.K1 + v] += weight * g1
-                        sums[planes.K2 + v] += weight * g2
-                        if geometry:
-                            sums[planes.M0 + v] += weight * g3
-                            sums[planes.M1 + v] += weight * g4
-                            sums[planes.M2 + v] += weight * g5
-                            sums[planes.GZ + v] += gt * s * inverse
-                            if solid:
-                                sums[planes.GP + v] += gp * r
+            sums[: len(sums) if geometry else planes.M0] = ZERO
+            while blocks:
+                block = lowest_bit(blocks)  # pyright: ignore[reportCallIssue]
+                blocks &= blocks - 1
+                top = np.float32(y_tile + block // BLOCKS_ACROSS * SIDE) - vc
+                left = np.float32(x_tile + block % BLOCKS_ACROSS * SIDE) - uc
+                base = np.uintp(block * LANES)
+                for lane in range(LANES):
+                    v = np.uintp(lane)
+                    k = base + v
+                    # response and alpha, as in the forward pass
+                    dx, dy = left + LANE_X[v], top + LANE_Y[v]
+                    before = state[k]
+                    s_row, e_row, f_row = ONE + q1 * dy, qc * dy * dy, TWO * qb * dy
+                    e, s, r, on = respond(dx, (qa, q0, eps, cutoff), s_row, e_row, f_row)
+                    r = r if on else ONE
+                    inverse = ONE / r
+                    exponent = -HALF * e * inverse
+                    alpha, after, state[k] = attenuate(exponent, on, before, opacity, alpha_max, stop)
+                    kept = alpha > ZERO
+                    weight = alpha * before
+                    # gradient of alpha: this Gaussian's value against everything behind it
+                    g0, g1, g2 = state[k + planes.G0], state[k + planes.G1], state[k + planes.G2]
+                    value = g0 * c0 + g1 * c1 + g2 * c2
+                    if geometry:
+                        peak, precision = z * s * inverse, a0 * r
+                        g3, g4, g5 = state[k + planes.G3], state[k + planes.G4], state[k + planes.G5]
+                        value = value + g3 * n0 + g4 * n1 + g5 * n2
+                        if not solid:
+                            toward = state[k + planes.GE]
+                            value = value + toward * peak
+                    rest = state[k + planes.REST] - weight * (value if kept else ZERO)
+                    state[k + planes.REST] = rest
+                    free = ONE / (ONE - alpha)
+                    slack = before * value - rest * free
+                    gt = gp = ZERO
+                    if geometry and solid:
+                        # implicit gradient of the median (paper, eqn tmed_grad), scaled by kd = incoming / S
+                        kd = state[k + planes.KD]
+                        d = state[k + planes.DEPTH] - peak
+                        bell = exp(-HALF * precision * d * d)
+                        gauss = alpha * bell
+                        half = HALF * kd / (ONE - gauss)
+                        behind = d > ZERO
+                        lifted, blocked = half * bell, kd * free
+                        slack += lifted - blocked if behind else -lifted
+                        pull = half * gauss * abs(d)
+                        gt = pull * precision if kept else ZERO
+                        gp = -HALF * pull * d if kept else ZERO
+                    elif geometry:
+                        crossing = (before > HALF) & (after <= HALF)
+                        gt = weight * toward + (state[k + planes.GM] if crossing else ZERO)
+                        gt = gt if kept else ZERO
+                    # chain rule to the response, then sums over the block
+                    ga = slack * alpha if (kept & (alpha < alpha_max)) else ZERO
+                    gd = -HALF * ga
+                    gr = -gd * e * inverse * inverse
+                    if geometry:
+                        gr = gr - gt * peak * inverse + gp * a0
+                    ge = gd * inverse + gr * eps
+                    gs = gt * z * inverse + TWO * gr * s if geometry else TWO * gr * s
+                    gex, gey = ge * dx, ge * dy
+                    sums[planes.AX + v] += gex
+                    sums[planes.AY + v] += gey
+                    sums[planes.AXX + v] += gex * dx
+                    sums[planes.AXY + v] += gex * dy
+                    sums[planes.AYY + v] += gey * dy
+                    sums[planes.B + v] += gs
+                    sums[planes.BX + v] += gs * dx
+                    sums[planes.BY + v] += gs * dy
+                    sums[planes.GR + v] += gr * e
+                    sums[planes.GO + v] += ga
+                    sums[planes.K0 + v] += weight * g0
+                    sums[planes.K1 + v] += weight * g1
+                    sums[planes.K2 + v] += weight * g2
+                    if geometry:
+                        sums[planes.M0 + v] += weight * g3
+                        sums[planes.M1 + v] += weight * g4
+                        sums[planes.M2 + v] += weight * g5
+                        sums[planes.GZ + v] += gt * s * inverse
+                        if solid:
+                            sums[planes.GP + v] += gp * r
             row = rows[places[p]]
             _reduce_color(sums, g, row)
             if geometry:
                 _reduce_geometry(sums, row)
-        for p in range(visited, len(members)):
-            row = rows[places[p]]
-            for j in range(ROW):
-                row[j] = ZERO
 
     return backward_tile
 
@@ -240,7 +228,7 @@ def _make_backward_tiles(geometry: bool, solid: bool) -> Callable[..., None]:
 
     @kernel(fastmath=FAST, error_model="numpy", nogil=True)
     def backward_tiles(
-        records, boxes, colors, members, places, starts, tiles, parameters, state, sums, staged, spans,
+        records, colors, members, visits, places, starts, tiles, parameters, state, sums, staged,
         color, normal, depth, transmittance,
         grad_color, grad_normal, grad_alpha, grad_solid, grad_expected, grad_crossing, rows,
     ):  # fmt: skip
@@ -258,8 +246,8 @@ def _make_backward_tiles(geometry: bool, solid: bool) -> Callable[..., None]:
             )  # fmt: skip
             begin, end = starts[tile], starts[tile + 1]
             args = (
-                records, colors, boxes, members[begin:end], places[begin:end], x_tile, y_tile, parameters,
-                state, sums, staged, spans, rows,
+                records, colors, members[begin:end], visits[begin:end], places[begin:end], x_tile, y_tile, parameters,
+                state, sums, staged, rows,
             )  # fmt: skip
             if solid:
                 _backward_solid(*args)

@@ -24,17 +24,19 @@ from vg2gt.rendering.cpu import planes
 from vg2gt.rendering.cpu.tiles import (
     BLOCKS,
     BLOCKS_ACROSS,
-    COLUMN,
     HIT_SIZE,
+    LANE_X,
+    LANE_Y,
     LANES,
     PLANE,
-    ROW_BITS,
     SIDE,
     STAGED,
     TILE,
     alive_blocks,
     any_positive,
     attenuate,
+    find_blocks,
+    lowest_bit,
     place_of,
     respond,
     stage,
@@ -46,8 +48,14 @@ def _make_blend_tile(geometry: bool, solid: bool) -> Callable[..., Any]:
     """Compiles the blending of one tile; ``geometry`` (depth and normals) and ``solid`` are constants in it."""
 
     @kernel_part(fastmath=FAST, error_model="numpy")
-    def blend_tile(records, colors, boxes, members, x_tile, y_tile, parameters, state, hits, counts, staged, spans):
-        """Blends one tile front to back; ``counts`` receives each block's number of hits for the depth solver."""
+    def blend_tile(
+        records, colors, boxes, members, visits, x_tile, y_tile, parameters, state, hits, counts, staged, touched
+    ):
+        """Blends one tile front to back.
+
+        ``counts`` receives each block's number of hits for the depth solver, ``visits`` a bit mask of the blocks that
+        each Gaussian changes, for the backward pass.
+        """
         alpha_max, stop, negligible = parameters[0], parameters[1], parameters[4]
         capacity = len(hits) // (BLOCKS * HIT_SIZE)
         alive = 0
@@ -57,70 +65,75 @@ def _make_blend_tile(geometry: bool, solid: bool) -> Callable[..., Any]:
                 alive = alive_blocks(state)
                 if not alive:
                     break
-                stage(records, colors, boxes, members[p : p + STAGED], x_tile, y_tile, staged, spans)
+                stage(records, colors, members[p : p + STAGED], staged)
+                find_blocks(boxes, members[p : p + STAGED], x_tile, y_tile, touched)
             g = staged[j]
             uc, vc, qa, qb, qc, q0, q1, z = g[0], g[1], g[2], g[3], g[4], g[5], g[6], g[7]
             a0, eps, opacity, cutoff = g[8], g[9], g[10], g[11]
             n0, n1, n2 = g[12], g[13], g[14]
             c0, c1, c2 = g[16], g[17], g[18]
-            for row in range(spans[j, 2], spans[j, 3]):
-                top = np.float32(y_tile + row * SIDE) - vc
-                for column in range(spans[j, 0], spans[j, 1]):
-                    block = row * BLOCKS_ACROSS + column
-                    if not alive >> block & 1:
-                        continue
-                    left = np.float32(x_tile + column * SIDE) - uc
-                    base = np.uintp(block * LANES)
-                    slot = min(counts[block], capacity - 1) if solid else 0
-                    place = np.uintp((block * capacity + slot) * HIT_SIZE)
-                    for lane in range(LANES):
-                        k = base + np.uintp(lane)
-                        dx = left + np.float32(np.int32(lane) & COLUMN)
-                        dy = top + np.float32(np.int32(lane) >> ROW_BITS)
-                        before = state[k]
-                        s_row, e_row, f_row = ONE + q1 * dy, qc * dy * dy, TWO * qb * dy
-                        e, s, r, on = respond(dx, before, (qa, q0, eps, cutoff), s_row, e_row, f_row)
-                        if geometry:
-                            r = r if on else ONE
-                            inverse = ONE / r
-                            exponent = -HALF * e * inverse
+            blocks = touched[j] & alive
+            changed = 0
+            while blocks:
+                block = lowest_bit(blocks)  # pyright: ignore[reportCallIssue]
+                blocks &= blocks - 1
+                top = np.float32(y_tile + block // BLOCKS_ACROSS * SIDE) - vc
+                left = np.float32(x_tile + block % BLOCKS_ACROSS * SIDE) - uc
+                base = np.uintp(block * LANES)
+                slot = min(counts[block], capacity - 1) if solid else 0
+                place = np.uintp((block * capacity + slot) * HIT_SIZE)
+                hit = False
+                for lane in range(LANES):
+                    v = np.uintp(lane)
+                    k = base + v
+                    dx, dy = left + LANE_X[v], top + LANE_Y[v]
+                    before = state[k]
+                    s_row, e_row, f_row = ONE + q1 * dy, qc * dy * dy, TWO * qb * dy
+                    e, s, r, on = respond(dx, (qa, q0, eps, cutoff), s_row, e_row, f_row)
+                    hit |= on & (before > ZERO)
+                    if geometry:
+                        r = r if on else ONE
+                        inverse = ONE / r
+                        exponent = -HALF * e * inverse
+                    else:
+                        exponent = -HALF * e / r
+                    alpha, after, state[k] = attenuate(exponent, on, before, opacity, alpha_max, stop)
+                    weight = alpha * before  # paper, eqn 3dgs_render_preliminary
+                    state[k + planes.C0] += weight * c0
+                    state[k + planes.C1] += weight * c1
+                    state[k + planes.C2] += weight * c2
+                    if geometry:
+                        peak = z * s * inverse
+                        state[k + planes.N0] += weight * n0
+                        state[k + planes.N1] += weight * n1
+                        state[k + planes.N2] += weight * n2
+                        crossing = (alpha > ZERO) & (before > HALF) & (after <= HALF)
+                        median = state[k + planes.MEDIAN]
+                        state[k + planes.MEDIAN] = peak if crossing else median
+                        if solid:
+                            precision = a0 * r
+                            lo, thin = state[k + planes.LO], state[k + planes.THIN]
+                            state[k + planes.LO] = min(lo, peak if alpha > ZERO else BIG)
+                            state[k + planes.THIN] = min(thin, precision if alpha > ZERO else BIG)
+                            # the median is in front of HI: a hit that begins far behind HI does not affect it
+                            early = before > QUARTER
+                            hi = state[k + planes.HI]
+                            hi = max(hi, peak if early & (alpha > ZERO) else ZERO)
+                            state[k + planes.HI] = hi
+                            beyond = peak - hi
+                            near_enough = (beyond <= ZERO) | (precision * beyond * beyond <= negligible)
+                            matters = (alpha > ZERO) & (early | near_enough)
+                            # an entry that does not matter is overwritten by the next hit
+                            to = place + v
+                            hits[to] = alpha if matters else ZERO
+                            hits[to + planes.HIT_PEAK] = peak
+                            hits[to + planes.HIT_PRECISION] = precision
                         else:
-                            exponent = -HALF * e / r
-                        alpha, after, state[k] = attenuate(exponent, on, before, opacity, alpha_max, stop)
-                        weight = alpha * before  # paper, eqn 3dgs_render_preliminary
-                        state[k + planes.C0] += weight * c0
-                        state[k + planes.C1] += weight * c1
-                        state[k + planes.C2] += weight * c2
-                        if geometry:
-                            peak = z * s * inverse
-                            state[k + planes.N0] += weight * n0
-                            state[k + planes.N1] += weight * n1
-                            state[k + planes.N2] += weight * n2
-                            crossing = (alpha > ZERO) & (before > HALF) & (after <= HALF)
-                            median = state[k + planes.MEDIAN]
-                            state[k + planes.MEDIAN] = peak if crossing else median
-                            if solid:
-                                precision = a0 * r
-                                lo, thin = state[k + planes.LO], state[k + planes.THIN]
-                                state[k + planes.LO] = min(lo, peak if alpha > ZERO else BIG)
-                                state[k + planes.THIN] = min(thin, precision if alpha > ZERO else BIG)
-                                # the median is in front of HI: a hit that begins far behind HI does not affect it
-                                early = before > QUARTER
-                                hi = state[k + planes.HI]
-                                hi = max(hi, peak if early & (alpha > ZERO) else ZERO)
-                                state[k + planes.HI] = hi
-                                beyond = peak - hi
-                                near_enough = (beyond <= ZERO) | (precision * beyond * beyond <= negligible)
-                                matters = (alpha > ZERO) & (early | near_enough)
-                                # an entry that does not matter is overwritten by the next hit
-                                to = place + np.uintp(lane)
-                                hits[to] = alpha if matters else ZERO
-                                hits[to + planes.HIT_PEAK] = peak
-                                hits[to + planes.HIT_PRECISION] = precision
-                            else:
-                                state[k + planes.MEAN] += weight * peak
-                    if solid:
-                        counts[block] += np.int64(any_positive(hits, place))  # pyright: ignore[reportCallIssue]
+                            state[k + planes.MEAN] += weight * peak
+                if solid:
+                    counts[block] += np.int64(any_positive(hits, place))  # pyright: ignore[reportCallIssue]
+                changed |= np.int64(hit) << block
+            visits[p] = changed
 
     return blend_tile
 
@@ -227,8 +240,8 @@ def _make_forward_tiles(geometry: bool, solid: bool) -> Callable[..., int]:
 
     @kernel(fastmath=FAST, error_model="numpy", nogil=True)
     def forward_tiles(
-        records, boxes, colors, members, starts, tiles, expected, steps, newton, parameters, background,
-        state, hits, counts, staged, spans, color, normal, depth, slope, transmittance,
+        records, boxes, colors, members, visits, starts, tiles, expected, steps, newton, parameters, background,
+        state, hits, counts, staged, touched, color, normal, depth, slope, transmittance,
     ):  # fmt: skip
         """Renders tiles ``tiles[0] .. tiles[1] - 1`` of one view.
 
@@ -239,14 +252,17 @@ def _make_forward_tiles(geometry: bool, solid: bool) -> Callable[..., int]:
         for tile in range(tiles[0], tiles[1]):
             x_tile, y_tile = (tile % across) * TILE, (tile // across) * TILE
             columns, rows = min(TILE, width - x_tile), min(TILE, height - y_tile)
-            mine = members[starts[tile] : starts[tile + 1]]
+            begin, end = starts[tile], starts[tile + 1]
             state[:] = ZERO
             counts[:] = 0
             start_rays(state, columns, rows)
             if solid:
                 state[planes.LO : planes.LO + PLANE] = BIG
                 state[planes.THIN : planes.THIN + PLANE] = BIG
-            args = (records, colors, boxes, mine, x_tile, y_tile, parameters, state, hits, counts, staged, spans)
+            args = (
+                records, colors, boxes, members[begin:end], visits[begin:end], x_tile, y_tile, parameters,
+                state, hits, counts, staged, touched,
+            )  # fmt: skip
             if solid:
                 _blend_solid(*args)
             elif geometry:

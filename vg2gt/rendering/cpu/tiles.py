@@ -19,11 +19,12 @@ SIDE = 4  # a block of SIDE x SIDE rays is one vector operation
 BLOCKS_ACROSS = TILE // SIDE
 BLOCKS = BLOCKS_ACROSS**2
 LANES = SIDE**2
-COLUMN, ROW_BITS = np.int32(SIDE - 1), np.int32(SIDE.bit_length() - 1)  # x: lane & COLUMN, y: lane >> ROW_BITS
+LANE_X, LANE_Y = (offset.ravel().astype(np.float32) for offset in np.meshgrid(np.arange(SIDE), np.arange(SIDE)))
 PLANE = TILE * TILE
 PLANES = 17  # planes of a tile's state
 SUMS_ROWS = 18  # gradient sums of one Gaussian, LANES values each
 HIT_SIZE = 3 * LANES  # one hit of a block's rays: alpha, peak, precision
+FIRST_COLUMN = sum(1 << row * BLOCKS_ACROSS for row in range(BLOCKS_ACROSS))  # bit mask of blocks
 STAGED = 16  # Gaussians copied at a time, with their colours
 RECORD = 16  # projected Gaussian: centre 2, conic 3, tilt 2, z, a0, eps, opacity, cutoff, normal 3, unused
 ROW = 16  # gradient of one (tile, Gaussian): centre 2, conic 3, tilt 2, z, a0, opacity, colour 3, normal 3
@@ -45,6 +46,30 @@ def any_positive(typing_context, values, first):
     return types.boolean(values, first), codegen
 
 
+@intrinsic
+def select(typing_context, condition, first, second):
+    """``first if condition else second`` without a branch, which could become a masked store: slow on many CPUs."""
+    kind = typing_context.unify_types(first, second)
+
+    def codegen(context, builder, signature, args):
+        values = (
+            context.cast(builder, value, given, kind) for value, given in zip(args[1:], signature.args[1:], strict=True)
+        )
+        return builder.select(args[0], *values)
+
+    return kind(types.boolean, first, second), codegen
+
+
+@intrinsic
+def lowest_bit(typing_context, bits):
+    """Index of the lowest bit that is set."""
+
+    def codegen(context, builder, signature, args):
+        return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
+
+    return bits(bits), codegen
+
+
 @kernel_part(fastmath=FAST, error_model="numpy")
 def alive_blocks(state):
     """Returns a bit mask of the blocks in which a ray has not stopped."""
@@ -57,7 +82,7 @@ def alive_blocks(state):
 @kernel_part(fastmath=FAST, error_model="numpy")
 def _touched(first, last):
     """Returns the range of blocks that pixels ``first .. last - 1`` along one axis touch, clipped to the tile."""
-    return max(first, 0) // SIDE, (min(last, TILE) + SIDE - 1) // SIDE
+    return np.int64(max(first, 0) // SIDE), np.int64((min(last, TILE) + SIDE - 1) // SIDE)
 
 
 @kernel_part(fastmath=FAST, error_model="numpy")
@@ -67,16 +92,25 @@ def place_of(y, x):
 
 
 @kernel_part(fastmath=FAST, error_model="numpy")
-def stage(records, colors, boxes, members, x_tile, y_tile, staged, spans):
-    """Copies record, colour and touched blocks of a tile's next Gaussians, so that cache misses overlap."""
+def stage(records, colors, members, staged):
+    """Copies record and colour of a tile's next Gaussians, so that cache misses overlap."""
     for j in range(len(members)):
         i = np.uintp(members[j])
         for k in range(RECORD):
             staged[j, k] = records[i, k]
         for k in range(3):
             staged[j, RECORD + k] = colors[i, k]
-        spans[j, 0], spans[j, 1] = _touched(boxes[i, 0] - x_tile, boxes[i, 1] - x_tile)
-        spans[j, 2], spans[j, 3] = _touched(boxes[i, 2] - y_tile, boxes[i, 3] - y_tile)
+
+
+@kernel_part(fastmath=FAST, error_model="numpy")
+def find_blocks(boxes, members, x_tile, y_tile, touched):
+    """Writes bit masks of the blocks of a tile that the boxes of its next Gaussians touch."""
+    for j in range(len(members)):
+        i = np.uintp(members[j])
+        x0, x1 = _touched(boxes[i, 0] - x_tile, boxes[i, 1] - x_tile)
+        y0, y1 = _touched(boxes[i, 2] - y_tile, boxes[i, 3] - y_tile)
+        lines = FIRST_COLUMN & ((1 << y1 * BLOCKS_ACROSS) - (1 << y0 * BLOCKS_ACROSS))
+        touched[j] = lines * ((1 << x1) - (1 << x0))
 
 
 @kernel_part(fastmath=FAST, error_model="numpy")
@@ -88,23 +122,27 @@ def start_rays(state, columns, rows):
 
 
 @kernel_part(fastmath=FAST, error_model="numpy", forceinline=True)
-def respond(dx, before, g, s_row, e_row, f_row):
+def respond(dx, g, s_row, e_row, f_row):
     """Returns a Gaussian's response along a ray (rendering/projection.py): E, 1 + s, r, and whether it is a hit."""
     qa, q0, eps, cutoff = g
     e = (qa * dx + f_row) * dx + e_row
     s = q0 * dx + s_row
     r = s * s + eps * e
-    return e, s, r, (e <= cutoff * r) & (s > ZERO) & (before > ZERO)
+    return e, s, r, (e <= cutoff * r) & (s > ZERO)
 
 
 @kernel_part(fastmath=FAST, error_model="numpy", forceinline=True)
 def attenuate(exponent, on, before, opacity, alpha_max, stop):
-    """Returns alpha (0 for no hit, or one that stops the ray), transmittance behind it, and the ray's next state."""
+    """Returns alpha (0 for no hit, a stopped ray, or a hit that stops it), transmittance behind it, and the next state.
+
+    A ray that has stopped needs no test: it has a negative transmittance, and so it stops again.
+    """
     full = min(opacity * exp(exponent), alpha_max)
-    full = full if on else ZERO
+    full = select(on, full, ZERO)  # pyright: ignore[reportCallIssue]
     after = before * (ONE - full)
-    stopped = on & (after < stop)
-    return ZERO if stopped else full, after, -before if stopped else after
+    stopped = after < stop
+    state = select(stopped, -abs(before), after)  # pyright: ignore[reportCallIssue]
+    return select(stopped, ZERO, full), after, state  # pyright: ignore[reportCallIssue]
 
 
 def depth_order(depths: NDArray) -> NDArray:
