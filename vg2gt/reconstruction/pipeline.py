@@ -38,25 +38,8 @@ from vg2gt.reconstruction.windows.store import (
     window_size,
 )
 from vg2gt.rendering import Renderer
-from vg2gt.runs.load import load_model
 from vg2gt.types import Cameras, Gaussians, Geometry
 from vg2gt.uncertainty import Calibration
-
-
-def reconstruct(
-    images: ImagesLike,
-    ckpt: str | Path | None = None,
-    backend: str | None = None,
-    *,
-    max_images: int | None = None,
-    size: int | tuple[int, int] | None = None,
-    window: int | None = None,
-    device: str = "auto",
-) -> Scene:
-    """Builds a model and reconstructs a scene: :func:`load_model`, then :func:`reconstruct_with`."""
-    ready = load_model(ckpt, backend, device=device)
-    choice = {"max_images": max_images, "size": size, "window": window}
-    return reconstruct_with(ready.model, images, renderer=ready.renderer, calibration=ready.calibration, **choice)
 
 
 @torch.no_grad()
@@ -76,7 +59,7 @@ def reconstruct_with(
     anchor: Anchor | None = None,
     calibration: Calibration | None = None,
 ) -> Scene:
-    """Reconstructs a scene from any number of images.
+    """Reconstructs a scene from any number of images, feed-forward; :mod:`vg2gt.api` then refines it.
 
     Args:
         model: the model; it is put into eval mode.

@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from vg2gt.reconstruction.scene import Scene
 
 Quality = Literal["draft", "normal", "high"]
+Refinement = bool | int | RefineOptions | None
+"""Whether and how a scene is refined: by the policy (True), never (False or 0), for a number of steps at the working
+size, with given options, or None: if :func:`refined_by_default`."""
 RECORDINGS = ("RGBDFolder", "TUM")  # their measured poses fit their depth better than bundle adjustment does
 
 
@@ -57,6 +60,29 @@ def refinement_for(
     if "seconds" in given and found.full is None:
         given = {"steps": None, **given}
     return replace(found, **given)
+
+
+def chosen_refinement(
+    scene: Scene, refine: Refinement = None, quality: Quality = "normal", overrides: Sequence[str] = ()
+) -> RefineOptions | None:
+    """Returns the options of a scene's refinement, None if it is not to be refined.
+
+    Args:
+        scene: the scene.
+        refine: whether and how (:data:`Refinement`); None with overrides refines.
+        quality: see :func:`refinement_for`.
+        overrides: see :func:`refinement_for`.
+
+    Raises:
+        ValueError: if an override or the quality is unknown.
+    """
+    if isinstance(refine, RefineOptions):
+        return refine
+    if refine is None:
+        refine = bool(overrides) or refined_by_default(scene)
+    if refine is True:
+        return refinement_for(scene, quality, overrides)
+    return replace(refinement_for(scene, quality, overrides, steps=refine), full=None) if refine else None
 
 
 def read_options(name: str, overrides: Sequence[str]) -> RefineOptions:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from vg2gt.monitor import Monitor
 from vg2gt.reconstruction.photographs import load_photographs
+from vg2gt.reconstruction.policy import Quality, Refinement, chosen_refinement
 from vg2gt.reconstruction.surroundings import without_debris
 from vg2gt.refinement import Observations, RefineOptions, exposure_rates, fold_of, refine, sharpened, split_views
 
@@ -58,6 +59,18 @@ def refine_scene(
             refined = sharpened(refined, photographs, seen, scene.renderer, options, left, _shown(advance), clock)
     made = replace(scene, gaussians=refined.scene.gaussians, cameras=refined.scene.cameras, refined=refined)
     return without_debris(made)
+
+
+def refined_by_policy(
+    scene: Scene,
+    refine: Refinement = None,
+    quality: Quality = "normal",
+    overrides: Sequence[str] = (),
+    monitor: Monitor | None = None,
+) -> Scene:
+    """Refines a scene if :func:`vg2gt.reconstruction.policy.chosen_refinement` says so; arguments as there."""
+    options = chosen_refinement(scene, refine, quality, overrides)
+    return scene if options is None else refine_scene(scene, options, monitor)
 
 
 def _shown(advance: Callable[..., None]) -> Callable[[int, float, float], None]:
