@@ -130,6 +130,9 @@ def refinement_lines(scene: Scene) -> list[str]:
     if (sharp := refined.sharpened) is not None and sharp.scores:
         lines.append(_judged(sharp.scores[-1], len(sharp.fold)))
     before, after = len(refined.start.gaussians), len(refined.scene.gaussians)
-    ended = {"interrupted": ", interrupted", "diverged": ", stopped because it diverged"}.get(refined.ended, "")
-    lines.append(f"best state: step {refined.step} of {refined.steps}{ended}; Gaussians: {before} -> {after}")
+    ended = {"interrupted": " (interrupted)", "diverged": " (stopped because it diverged)"}.get(refined.ended, "")
+    kept = f"; the scene after step {refined.step} was the best and is kept" if refined.step < refined.steps else ""
+    if refined.step == 0:
+        kept = "; no step was better than the scene before, which is kept"
+    lines.append(f"refined for {refined.steps} steps{ended}{kept}; Gaussians: {before} -> {after}")
     return lines
