@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from vg2gt.geometry.precision import half_precision_on_gpu
+from vg2gt.inputs.camera_source import CameraSource
 from vg2gt.inputs.cameras import Poses, pictures_for
 from vg2gt.inputs.inputs import Views, as_given, in_order, load_views, source_of, working_order, working_size
-from vg2gt.inputs.pictures import SFM_SOURCE, ImagesLike, Picture
+from vg2gt.inputs.pictures import ImagesLike, Picture
 from vg2gt.io.files import by_number
 from vg2gt.memory import RECONSTRUCTION, memory_advice, note_sizes
 from vg2gt.model import VG2GT, Reconstructor
@@ -146,7 +147,7 @@ def _scene(parts: _Parts, pictures: Sequence[Picture], renderer: Renderer, is_me
     source = pictures[0].source
     known = [picture.pose for picture in pictures if picture.pose is not None]
     given = np.stack(known) if source and len(known) == len(pictures) else None
-    target = "given" if source and not source.startswith(SFM_SOURCE) else "upright"
+    target = "given" if CameraSource.of(source) in (CameraSource.GIVEN, CameraSource.RECORDED) else "upright"
     frame = first_frame(geometry.cameras, float(parts.unit), given, target)
     metres = frame.scale if pictures[0].is_metric else None
     return Scene(

@@ -49,13 +49,13 @@ def refine_scene(
     if full is not None and options.seconds is not None:
         at_working_size = replace(options, seconds=WORKING_SHARE * options.seconds)
     fold = None if full is None else fold_of(split_views(len(scene.names), options.holdout)[0], full)
-    with monitor.stage("refine", 100) as advance:
+    with monitor.stage("refine", 100, " %") as advance:
         observe = _shown(advance)
         refined = refine(scene.gaussians, scene.cameras, seen, scene.renderer, at_working_size, observe, clock, fold)
     if full is not None and refined.ended in ("steps", "seconds"):
         photographs = load_photographs(scene.pictures, refined.scene.cameras, full.size, monitor).to(device)
         left = None if options.seconds is None else max(0.0, options.seconds - (clock() - began))
-        with monitor.stage("refine at full size", 100) as advance:
+        with monitor.stage("refine at full size", 100, " %") as advance:
             refined = sharpened(refined, photographs, seen, scene.renderer, options, left, _shown(advance), clock)
     made = replace(scene, gaussians=refined.scene.gaussians, cameras=refined.scene.cameras, refined=refined)
     return without_debris(made)

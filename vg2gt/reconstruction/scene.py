@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from vg2gt.geometry.cameras import unproject
+from vg2gt.inputs.camera_source import CameraSource
 from vg2gt.inputs.inputs import photo_of
 from vg2gt.inputs.pictures import Picture
 from vg2gt.io.cameras_json import NamedCamera, named_cameras
@@ -105,6 +106,11 @@ class Scene:
     poses: Tensor | None = None
     error: Tensor | None = None
     support: Tensor | None = None
+
+    @property
+    def camera_source(self) -> CameraSource:
+        """Kind of origin of the cameras."""
+        return CameraSource.of(self.cameras_from)
 
     @cached_property
     def gaussian_trust(self) -> dict[str, Tensor] | None:
