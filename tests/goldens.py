@@ -63,14 +63,14 @@ def _evaluate() -> Values:
 
 def _reconstruct() -> Values:
     """A scene of a written recording by the weights that ship, rendered."""
+    import vg2gt
     from tests.data.sources import layout_nerfstudio
     from tests.data.sources.layouts import room
-    from vg2gt import load_model, reconstruct_with
 
     with tempfile.TemporaryDirectory() as folder:
         layout_nerfstudio.write(Path(folder), room())
         recording = next(Path(folder).rglob("transforms.json")).parent
-        scene = reconstruct_with(load_model(device="cpu").model, recording, size=112)
+        scene = vg2gt.load(device="cpu").reconstruct(recording, size=112)
     found: dict[str, torch.Tensor] = {}
     for index, view in enumerate(scene.render()):
         found |= {f"{name} {index}": getattr(view, name) for name in ("color", "depth", "normal", "alpha")}

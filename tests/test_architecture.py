@@ -40,10 +40,12 @@ MAY_IMPORT: dict[str, set[str]] = {
         "data",
     }
     | BASICS,
-    "outputs": {"monitor", "inputs", "reconstruction", "visibility", "rendering"} | BASICS,
+    "outputs": {"monitor", "inputs", "reconstruction", "visibility", "rendering", "viewer"} | BASICS,
+    "api": {"monitor", "inputs", "reconstruction", "outputs", "runs"},
     "training": {"evaluation", "runs", "model", "losses", "rendering", "data", "backends"} | BASICS,
     "studies": {"training", "evaluation", "runs"} | BASICS,
     "cli": {
+        "api",
         "studies",
         "training",
         "evaluation",

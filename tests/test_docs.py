@@ -17,6 +17,7 @@ from tests.training_helpers import group_options
 from vg2gt.cli.arguments import separate
 from vg2gt.cli.commands import COMMANDS, DATA_COMMANDS
 from vg2gt.config import compose, config_dir
+from vg2gt.memory import RECONSTRUCTION
 
 DOCS = sorted((ROOT / "docs").rglob("*.md"))
 PAGES = [
@@ -173,7 +174,21 @@ def test_figures_of_photos_are_the_newest_measured() -> None:
     shown = {row for row in rows(ROOT / "docs" / "results.md") if "default" in row}
     assert len(shown) >= 10
     assert shown <= measured
-    assert {row for row in rows(ROOT / "README.md") if "default" in row} <= shown
+    words = {tuple(" ".join(row).replace(" default ", " ").split()) for row in shown}
+    pairs = [row for row in rows(ROOT / "README.md") if row[1] in ("VG²GT", "OpenSplat")]
+    assert len(pairs) >= 4
+    assert {tuple(" ".join(row).split()) for row in pairs} <= words
+
+
+def test_the_readme_links_no_page_that_would_be_shown_as_source() -> None:
+    assert not re.findall(r"\]\(([^)]+\.html)\)", (ROOT / "README.md").read_text())
+
+
+def test_advice_names_options_that_exist() -> None:
+    """What is said when memory is full."""
+    flags = re.findall(r"--[a-z-]+", RECONSTRUCTION)
+    assert flags
+    assert set(flags) <= set(re.findall(r"--[a-z-]+", help_of("reconstruct")))
 
 
 def test_the_site_builds(tmp_path: Path) -> None:

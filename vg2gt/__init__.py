@@ -8,32 +8,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from vg2gt.api import Pipeline, load
     from vg2gt.model import VG2GT
-    from vg2gt.reconstruction.pipeline import reconstruct, reconstruct_with
     from vg2gt.reconstruction.scene import Scene
-    from vg2gt.runs.load import load_model
-    from vg2gt.runs.pretrained import from_pretrained, list_models, push_to_hub, save_pretrained
+    from vg2gt.runs.pretrained import list_models, push_to_hub, save_pretrained
 
-__all__ = [
-    "VG2GT",
-    "Scene",
-    "from_pretrained",
-    "list_models",
-    "load_model",
-    "push_to_hub",
-    "reconstruct",
-    "reconstruct_with",
-    "save_pretrained",
-]
+__all__ = ["VG2GT", "Pipeline", "Scene", "list_models", "load", "push_to_hub", "save_pretrained"]
 __version__ = "0.1.0"
 
 _HOMES = {
     "VG2GT": "vg2gt.model",
-    "load_model": "vg2gt.runs.load",
-    **dict.fromkeys(("from_pretrained", "list_models", "push_to_hub", "save_pretrained"), "vg2gt.runs.pretrained"),
+    **dict.fromkeys(("Pipeline", "load"), "vg2gt.api"),
+    **dict.fromkeys(("list_models", "push_to_hub", "save_pretrained"), "vg2gt.runs.pretrained"),
     "Scene": "vg2gt.reconstruction.scene",
-    "reconstruct": "vg2gt.reconstruction.pipeline",
-    "reconstruct_with": "vg2gt.reconstruction.pipeline",
 }
 
 

@@ -22,7 +22,7 @@ EVALUATION = (
     "(+backend.head_chunk=2, +model.fine.dense_head.views_per_chunk=2)"
 )
 RECONSTRUCTION = (
-    "fewer images (--max-images, --every), smaller ones (--size), fewer voxels (model.fine.max_voxels=500000), "
+    "fewer images (--max-images), smaller ones (--size), fewer voxels (model.fine.max_voxels=500000), "
     "fewer Gaussians (model.gaussians.max_gaussians=1000000) or smaller chunks (backend.head_chunk=2, "
     "model.fine.dense_head.views_per_chunk=2)"
 )

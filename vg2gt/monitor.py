@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 import torch
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from vg2gt.profiling import listening, now, peak_memory_mib, reset_peak_memory
 
@@ -39,7 +39,7 @@ class Monitor:
         self._progress = Progress(
             TextColumn("{task.description:<24}"),
             BarColumn(24),
-            MofNCompleteColumn(),
+            TextColumn("{task.completed:.0f}/{task.total:.0f}{task.fields[unit]}"),
             TimeElapsedColumn(),
             TimeRemainingColumn(),
             console=Console(stderr=True),
@@ -62,8 +62,8 @@ class Monitor:
         return peak_memory_mib(self.device)
 
     @contextmanager
-    def stage(self, name: str, total: int = 1) -> Iterator[Callable[..., None]]:
-        """Measures the block.
+    def stage(self, name: str, total: int = 1, unit: str = "") -> Iterator[Callable[..., None]]:
+        """Measures the block; ``unit`` is shown after the number of steps.
 
         Yields:
             A function to call after each of ``total`` steps, or with the number of steps done and a note to show.
@@ -71,7 +71,7 @@ class Monitor:
         self._settle()
         self._running.append(name)
         self.seconds.setdefault(name, 0.0)
-        task = self._progress.add_task(name, total=total)
+        task = self._progress.add_task(name, total=total, unit=unit)
 
         def advance(done: float | None = None, note: str = "") -> None:
             if done is None:

@@ -41,7 +41,7 @@ def test_the_upright_frame_goes_into_the_given_one(folder: Path, frames, model, 
     """As the frame's similarity says; found cameras are written upright."""
     put_colmap(folder, frames)
     given = reconstruct_with(model, folder)
-    monkeypatch.setattr("vg2gt.reconstruction.pipeline.SFM_SOURCE", "COLMAP")
+    monkeypatch.setattr("vg2gt.inputs.camera_source.SFM_SOURCE", "COLMAP")
     scene = reconstruct_with(model, folder)
     assert scene.frame.name == "upright"
     to_given = torch.from_numpy(scene.frame.to_source).float()
@@ -58,7 +58,7 @@ def test_the_upright_frame_goes_into_the_given_one(folder: Path, frames, model, 
 def test_metric_cameras_give_metres(recording: Path, ready, monkeypatch) -> None:
     scene = reconstruct_with(ready.model, recording)
     assert scene.metres_per_unit == pytest.approx(1)
-    monkeypatch.setattr("vg2gt.reconstruction.pipeline.SFM_SOURCE", "RGBDFolder")
+    monkeypatch.setattr("vg2gt.inputs.camera_source.SFM_SOURCE", "RGBDFolder")
     upright = reconstruct_with(ready.model, recording)
     assert upright.metres_per_unit == pytest.approx(upright.frame.scale)
     assert upright.metres_per_unit != pytest.approx(1, abs=0.01)

@@ -1,4 +1,5 @@
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,10 @@ import vg2gt
 from vg2gt.config import compose_groups
 from vg2gt.memory import OutOfMemory
 from vg2gt.method import FineModule
+from vg2gt.reconstruction import refined
+from vg2gt.reconstruction.pipeline import reconstruct_with
+from vg2gt.reconstruction.policy import refinement_for
+from vg2gt.refinement import RefineOptions
 from vg2gt.runs.checkpoints import read_checkpoint, write_checkpoint, write_slim
 from vg2gt.runs.load import SHIPPED, load_model, made_of, resolve_parts
 
@@ -123,14 +128,49 @@ def test_weights_of_a_diverged_training_are_refused(run_folder: Path, tmp_path: 
 
 
 def test_python_interface(run_folder: Path, recording: Path, tmp_path: Path) -> None:
-    loaded = vg2gt.load_model(run_folder, device="cpu")
-    scene = vg2gt.reconstruct_with(loaded.model, recording, size=56, max_images=2)
+    model = vg2gt.load(run_folder, overrides=["renderer.alpha_max=0.9"], device="cpu")
+    scene = model.reconstruct(recording, size=56, max_images=2)
+    assert scene.renderer.alpha_max == 0.9
     assert isinstance(scene, vg2gt.Scene)
     assert (scene.images.shape, scene.names) == ((2, 3, 42, 56), ("008", "011"))
-    again = vg2gt.reconstruct(recording, run_folder, size=56, max_images=2, device="cpu")
+    again = reconstruct_with(load_model(run_folder, device="cpu").model, recording, size=56, max_images=2)
     assert torch.equal(again.gaussians.means, scene.gaussians.means)
-    scene.save(tmp_path / "out", ["scene.ply"])
-    assert (tmp_path / "out" / "scene.ply").is_file()
+    out = scene.save(tmp_path / "out", ["scene.ply"])
+    with pytest.raises(FileExistsError, match="already exists"):
+        scene.save(out, ["scene.ply"])
+    before = (out / "scene.ply").stat().st_mtime_ns
+    scene.save(out, ["scene.ply", "scene.html"], overwrite=True)
+    assert (out / "scene.ply").stat().st_mtime_ns > before
+    assert "<title>out</title>" in (out / "scene.html").read_text()
+
+
+def test_errors_are_stated_and_the_scene_is_refined_by_its_kind(recording: Path, monkeypatch) -> None:
+    """A loaded model brings its calibration; photographs are refined unless asked not to, recordings on demand."""
+    asked: list[RefineOptions] = []
+    monkeypatch.setattr(refined, "refine_scene", lambda scene, how, *_: asked.append(how) or scene)
+    model = vg2gt.load(device="cpu")
+    scene = model.reconstruct(recording, size=56, max_images=2)
+    assert (scene.error is not None, asked) == (True, [])
+    photographs = replace(scene, cameras_from="COLMAP here")
+    for each, refine, quality in (
+        (photographs, None, "normal"),
+        (photographs, False, "normal"),
+        (photographs, 0, "normal"),
+        (photographs, True, "draft"),
+        (photographs, 7, "normal"),
+        (scene, None, "high"),
+        (scene, True, "normal"),
+        (scene, RefineOptions(steps=3), "normal"),
+    ):
+        refined.refined_by_policy(each, refine, quality)
+    normal, draft = refinement_for(photographs), refinement_for(photographs, "draft")
+    seven = replace(normal, steps=7, full=None)
+    assert asked == [normal, draft, seven, refinement_for(scene), RefineOptions(steps=3)]
+    asked.clear()
+    model.reconstruct(recording, size=56, max_images=2, overrides=["refine.steps=5"])
+    photographs.refine(steps=50)
+    scene.refine(steps=50)
+    assert asked == [replace(refinement_for(scene), steps=5), replace(normal, steps=50), RefineOptions(steps=50)]
 
 
 @pytest.mark.parametrize("error", [torch.OutOfMemoryError("CUDA out of memory"), MemoryError("no more")])
@@ -140,4 +180,4 @@ def test_full_memory_names_the_knobs(error: Exception, ready, recording: Path, m
 
     monkeypatch.setattr(ready.model.fine, "forward", fail)
     with pytest.raises(OutOfMemory, match=r"4 images of 84x112.*--max-images.*--size.*head_chunk"):
-        vg2gt.reconstruct_with(ready.model, recording)
+        reconstruct_with(ready.model, recording)

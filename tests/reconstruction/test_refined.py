@@ -20,9 +20,9 @@ from vg2gt.monitor import Monitor
 from vg2gt.outputs.saved import near_of, read_scene
 from vg2gt.reconstruction.photographs import full_size, load_photographs
 from vg2gt.reconstruction.policy import refined_by_default, refinement_for
-from vg2gt.reconstruction.refined import _judged
+from vg2gt.reconstruction.refined import _judged, refinement_lines
 from vg2gt.reconstruction.scene import Scene
-from vg2gt.refinement import RefineOptions, RefineRates
+from vg2gt.refinement import Refined, RefinedScene, RefineOptions, RefineRates
 from vg2gt.rendering import Renderer
 
 ORACLE = ["backend=oracle", "backend.depth_noise=0.02", "--quiet", "--device", "cpu"]
@@ -58,6 +58,24 @@ def test_the_command(saved: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytes
     vg2gt(monkeypatch, *again)  # a refined folder is one too
     with pytest.raises(SystemExit, match="already exists"):
         vg2gt(monkeypatch, *again)
+
+
+def test_kinds_of_cameras_are_told_apart_in_one_place(scene: Scene) -> None:
+    described = {"": "PREDICTED", "structure from motion, 4 of 4 images": "FOUND", "RGBDFolder a": "RECORDED"}
+    described |= {"TUM a": "RECORDED", "COLMAP a": "GIVEN", "poses a": "GIVEN", "cameras.json": "GIVEN"}
+    assert {text: replace(scene, cameras_from=text).camera_source.name for text in described} == described
+
+
+def test_the_summary_says_which_state_is_kept(scene: Scene) -> None:
+    state, few = RefinedScene(scene.gaussians, scene.cameras, torch.ones(4, 3), torch.zeros(4, 3)), len(scene.gaussians)
+    views, none = torch.arange(4), torch.arange(0)
+    psnr = torch.tensor([[20.0] * 4, [25.0] * 4])
+    for step, said in ((8, ""), (6, "; the scene after step 6 was the best and is kept"), (0, "; no step was better")):
+        refined = Refined(state, state, step, 8, 1.0, "steps", psnr, views, none)
+        table, last = refinement_lines(replace(scene, refined=refined))
+        assert table == "trained on     4 views:  20.00 ->  25.00 dB"
+        assert last.startswith(f"refined for 8 steps{said}")
+        assert last.endswith(f"; Gaussians: {few} -> {few}")
 
 
 def test_photographs_are_refined_unless_asked_not_to(scene: Scene) -> None:

@@ -18,7 +18,7 @@ from vg2gt.outputs.outputs import write_outputs
 from vg2gt.outputs.saved import read_scene
 from vg2gt.reconstruction.pipeline import reconstruct_with
 from vg2gt.reconstruction.scene import Scene
-from vg2gt.reconstruction.trust import pixel_trust, trust_line, trust_picture, trusted
+from vg2gt.reconstruction.trust import pixel_trust, trust_lines, trust_picture, trusted
 from vg2gt.rendering import Renderer
 from vg2gt.runs import load
 from vg2gt.types import Cameras, Geometry, Prediction
@@ -92,8 +92,16 @@ def test_reports_say_it(written: Path, stated: Scene, scene: Scene) -> None:
     assert trust["gaussians"]["agreed"] > 0.3
     assert trust["level"] == 0.9
     assert trust["error_of_pixels"] == pytest.approx(0.01, rel=1e-3)
-    assert "within 1 % (90 % sure)" in trust_line(stated)
-    assert "no calibration" in trust_line(scene)
+    agreed, single = (100 * trust["gaussians"][name] for name in ("agreed", "single"))
+    confirmed, *_, error = trust_lines(stated)
+    assert confirmed.startswith(f"Gaussians: {agreed:.0f} % are confirmed by two or more views; ")
+    assert f"; {single:.0f} % were seen by one view only (single)" in confirmed
+    assert error == "depth: for half of the pixels, the error stays below 1 % in 9 of 10 cases"
+    assert "no calibration" in trust_lines(scene)[-1]
+    lonely = replace(stated, support=torch.full_like(stated.support, Status.SINGLE))
+    lonely.__dict__["gaussian_trust"] = {"support": torch.full((len(stated.gaussians),), Status.SINGLE)}
+    assert trust_lines(lonely)[0].startswith("Gaussians: 0 % are confirmed")
+    assert "take more photographs" in trust_lines(lonely)[1]
 
 
 def test_what_is_not_trusted_is_left_out(stated: Scene) -> None:

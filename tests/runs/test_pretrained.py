@@ -25,18 +25,18 @@ def test_a_name_a_folder_and_a_name_on_the_hub_give_the_same_model(
         return str(shutil.copy(folder / name, tmp_path / "cache" / name))
 
     monkeypatch.setattr("huggingface_hub.hf_hub_download", download)
-    by_name = vg2gt.from_pretrained("sweep-tiny", device="cpu")
+    by_name = vg2gt.load("sweep-tiny", device="cpu")
     assert (vg2gt.list_models(), by_name.weights.path) == (("sweep-tiny",), SHIPPED)
     shipped = by_name.model.trained_state()
     for name, revision in ((folder, None), ("somebody/rooms", "v1")):
-        found = vg2gt.from_pretrained(name, revision=revision, device="cpu")
+        found = vg2gt.load(name, revision=revision, device="cpu")
         assert found.calibration is not None
         state = found.model.trained_state()
         assert state.keys() == shipped.keys()
         assert all(torch.equal(state[name], shipped[name]) for name in shipped)
     assert asked == [("somebody/rooms", name, "v1") for name in FILES[:2]]
     with pytest.raises(FileNotFoundError, match="no such checkpoint or run"):
-        vg2gt.from_pretrained("nowhere", device="cpu")
+        vg2gt.load("nowhere", device="cpu")
 
 
 def test_what_is_uploaded_is_data_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from vg2gt.cli.arguments import OVERRIDES, add_common_flags, flag_parser, list_of_names, listing, separate
 from vg2gt.cli.errors import errors_in_one_line
-from vg2gt.outputs.output_names import DEFAULT, LARGE, OUTPUTS, PREDICTED, SFM, TILES
+from vg2gt.outputs.output_names import DEFAULT, LARGE, OUTPUTS, PREDICTED, TILES
 from vg2gt.reconstruction.windows import WINDOWS
 
 POSES = (
@@ -32,10 +32,9 @@ QUALITY = (
 REFINE = "refine for N steps at the working size only, recordings too; 0: feed-forward"
 
 if TYPE_CHECKING:
+    from vg2gt.api import Pipeline
     from vg2gt.monitor import Monitor
     from vg2gt.reconstruction.scene import Scene
-    from vg2gt.refinement import RefineOptions
-    from vg2gt.runs.load import LoadedModel
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -71,14 +70,15 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     """Reconstructs a scene and writes the outputs."""
+    from vg2gt.api import load
     from vg2gt.memory import RECONSTRUCTION, memory_advice
     from vg2gt.monitor import Monitor
     from vg2gt.outputs.outputs import cost_figures, write_outputs
     from vg2gt.reconstruction.policy import read_options
-    from vg2gt.reconstruction.refined import refine_scene, refinement_lines
-    from vg2gt.reconstruction.trust import trust_line, trusted
+    from vg2gt.reconstruction.refined import refinement_lines
+    from vg2gt.reconstruction.trust import trust_lines, trusted
     from vg2gt.reconstruction.windows.store import remove, tidy
-    from vg2gt.runs.load import choose_device, load_model
+    from vg2gt.runs.load import choose_device
 
     changed = options.add or options.take_out
     options.out = str(Path(changed or options.out).expanduser())
@@ -89,11 +89,8 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     read_options("photographs", how_to_refine)  # reports wrong options before any work
     with Monitor(show=not options.quiet, device=choose_device(options.device)) as monitor:
         with monitor.stage("load model"):
-            ready = load_model(options.ckpt, overrides=overrides, device=options.device)
-        scene = _scene(options, ready, monitor)
-        how = _refinement(scene, options, how_to_refine)
-        if how is not None:
-            scene = refine_scene(scene, how, monitor)
+            ready = load(options.ckpt, overrides=overrides, device=options.device)
+        scene = _scene(options, ready, how_to_refine, monitor)
         scene = trusted(scene, options.min_confidence, options.drop)
         if len(scene.gaussians) > LARGE and TILES not in options.save:
             options.save.append(TILES)
@@ -123,7 +120,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     print(f"{len(scene.names)} images of {height}x{width}: {len(scene.gaussians)} Gaussians")
     if scene.refined is not None:
         print(*refinement_lines(scene), sep="\n")
-    print(trust_line(scene))
+    print(*trust_lines(scene), sep="\n")
     print(f"weights: {figures['weights']}; cameras: {scene.cameras_from or PREDICTED}")
     print(f"seconds: {times}; peak memory {cost['peak_memory_mib']} MiB")
     print(f"written: {', '.join(str(folder / name) for name in options.save)}")
@@ -152,43 +149,34 @@ def _check(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     check_inputs(backend_class(options.ckpt, overrides), options.images, options.poses)
 
 
-def _scene(options: argparse.Namespace, ready: LoadedModel, monitor: Monitor) -> Scene:
-    """Makes a new scene, or adds images to the one in the folder, or removes some."""
-    from vg2gt.reconstruction.pipeline import add_images, reconstruct_with, take_out
+def _scene(options: argparse.Namespace, ready: Pipeline, overrides: Sequence[str], monitor: Monitor) -> Scene:
+    """Makes a new scene, or adds images to the one in the folder, or removes some; refines it if it is to be."""
+    from vg2gt.reconstruction.pipeline import add_images, take_out
+    from vg2gt.reconstruction.refined import refined_by_policy
     from vg2gt.reconstruction.windows.run import window_model
     from vg2gt.runs.load import find_calibration
 
-    calibration, renderer, out = ready.calibration, replace(ready.renderer, mode=options.mode), Path(options.out)
-    if options.calibration is not None:
-        calibration = find_calibration(ready.model, ready.weights, options.calibration)
+    renderer, out = replace(ready.renderer, mode=options.mode), Path(options.out)
     if options.add or options.take_out:
         change = add_images if options.add else take_out
-        return change(window_model(ready.model), out, options.images, renderer, monitor, options.window)
-    return reconstruct_with(
-        ready.model,
+        scene = change(window_model(ready.model), out, options.images, renderer, monitor, options.window)
+        return refined_by_policy(scene, options.refine, options.quality, overrides, monitor)
+    calibration = ready.calibration
+    if options.calibration is not None:
+        calibration = find_calibration(ready.model, ready.weights, options.calibration)
+    return replace(ready, renderer=renderer, calibration=calibration).reconstruct(
         options.images,
-        max_images=options.max_images,
         size=options.size,
-        renderer=renderer,
-        monitor=monitor,
+        quality=options.quality,
+        refine=options.refine,
+        overrides=overrides,
+        max_images=options.max_images,
         poses=options.poses,
-        sfm_folder=out / SFM,
         window=options.window,
-        window_folder=out / WINDOWS,
+        folder=out,
         keep_windows=options.keep_windows,
-        calibration=calibration,
+        monitor=monitor,
     )
-
-
-def _refinement(scene: Scene, options: argparse.Namespace, overrides: Sequence[str]) -> RefineOptions | None:
-    """Refinement options; None without refinement: it is switched off, or a recording or long capture without any."""
-    from vg2gt.reconstruction.policy import refined_by_default, refinement_for
-
-    wanted = options.refine is not None or bool(overrides)
-    if options.refine == 0 or not (wanted or refined_by_default(scene)):
-        return None
-    how = refinement_for(scene, options.quality, overrides, steps=options.refine)
-    return how if options.refine is None else replace(how, full=None)
 
 
 def _size(text: str) -> int | tuple[int, int]:

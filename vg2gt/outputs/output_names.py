@@ -12,6 +12,7 @@ MAPS = {
 OUTPUTS = {
     "scene.ply": "the Gaussians, as 3D Gaussian Splatting writes them, with error and support",
     "scene.spz": "the same, about 16 bytes each (Niantic's SPZ, version 3)",
+    "scene.html": "a page that shows the scene in a browser, as vg2gt view writes it",
     "tiles": "the same split into regions, SPZ files and index.json in tiles/; default above a million Gaussians",
     "cameras.json": "the cameras of the views",
     "points.ply": "coloured points of the decoded depth",

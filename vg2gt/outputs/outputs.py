@@ -39,6 +39,7 @@ from vg2gt.outputs.export import exported_views
 from vg2gt.outputs.output_names import DEFAULT, MAPS, OUTPUTS, PREDICTED
 from vg2gt.reconstruction.refined import refinement_figures
 from vg2gt.reconstruction.trust import trust_figures, trust_picture
+from vg2gt.viewer import ViewerScene, scene_title, thumbnail, write_viewer_html
 from vg2gt.visibility import Status, point_support
 
 if TYPE_CHECKING:
@@ -293,6 +294,12 @@ def _scene_ply(scene: Scene, path: Path) -> None:
     write_gaussian_ply(path, scene.gaussians, extra=known)
 
 
+def _page(scene: Scene, path: Path) -> None:
+    pictures = [thumbnail(to_pixels(image)) for image in scene.images]
+    cameras, near = scene.named_cameras(), scene.renderer.near
+    write_viewer_html(path, ViewerScene(scene.gaussians, cameras, pictures, scene_title(path), near))
+
+
 def _points_ply(scene: Scene, path: Path) -> None:
     points = scene.points()
     write_point_ply(path, points.positions, points.colors)
@@ -306,6 +313,7 @@ def _target(output: str) -> str:
 _WRITERS: dict[str, Callable[[Scene, Path], Any]] = {
     "scene.ply": _scene_ply,
     "scene.spz": lambda scene, path: write_spz(path, scene.gaussians),
+    "scene.html": _page,
     "tiles": _tiles,
     "cameras.json": lambda scene, path: write_cameras_json(path, scene.named_cameras()),
     "points.ply": _points_ply,

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from vg2gt.geometry.precision import half_precision_on_gpu
+from vg2gt.inputs.camera_source import CameraSource
 from vg2gt.inputs.cameras import Poses, pictures_for
 from vg2gt.inputs.inputs import Views, as_given, in_order, load_views, source_of, working_order, working_size
-from vg2gt.inputs.pictures import SFM_SOURCE, ImagesLike, Picture
+from vg2gt.inputs.pictures import ImagesLike, Picture
 from vg2gt.io.files import by_number
 from vg2gt.memory import RECONSTRUCTION, memory_advice, note_sizes
 from vg2gt.model import VG2GT, Reconstructor
@@ -38,25 +39,8 @@ from vg2gt.reconstruction.windows.store import (
     window_size,
 )
 from vg2gt.rendering import Renderer
-from vg2gt.runs.load import load_model
 from vg2gt.types import Cameras, Gaussians, Geometry
 from vg2gt.uncertainty import Calibration
-
-
-def reconstruct(
-    images: ImagesLike,
-    ckpt: str | Path | None = None,
-    backend: str | None = None,
-    *,
-    max_images: int | None = None,
-    size: int | tuple[int, int] | None = None,
-    window: int | None = None,
-    device: str = "auto",
-) -> Scene:
-    """Builds a model and reconstructs a scene: :func:`load_model`, then :func:`reconstruct_with`."""
-    ready = load_model(ckpt, backend, device=device)
-    choice = {"max_images": max_images, "size": size, "window": window}
-    return reconstruct_with(ready.model, images, renderer=ready.renderer, calibration=ready.calibration, **choice)
 
 
 @torch.no_grad()
@@ -76,7 +60,7 @@ def reconstruct_with(
     anchor: Anchor | None = None,
     calibration: Calibration | None = None,
 ) -> Scene:
-    """Reconstructs a scene from any number of images.
+    """Reconstructs a scene from any number of images, feed-forward; :mod:`vg2gt.api` then refines it.
 
     Args:
         model: the model; it is put into eval mode.
@@ -163,7 +147,7 @@ def _scene(parts: _Parts, pictures: Sequence[Picture], renderer: Renderer, is_me
     source = pictures[0].source
     known = [picture.pose for picture in pictures if picture.pose is not None]
     given = np.stack(known) if source and len(known) == len(pictures) else None
-    target = "given" if source and not source.startswith(SFM_SOURCE) else "upright"
+    target = "given" if CameraSource.of(source) in (CameraSource.GIVEN, CameraSource.RECORDED) else "upright"
     frame = first_frame(geometry.cameras, float(parts.unit), given, target)
     metres = frame.scale if pictures[0].is_metric else None
     return Scene(

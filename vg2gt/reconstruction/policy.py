@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from hydra.utils import instantiate
 
 from vg2gt.config import compose_groups
+from vg2gt.inputs.camera_source import CameraSource
 from vg2gt.reconstruction.windows.store import AUTOMATIC
 from vg2gt.refinement import RefineOptions, RefineRates
 from vg2gt.types import check_choice
@@ -17,17 +18,14 @@ if TYPE_CHECKING:
     from vg2gt.reconstruction.scene import Scene
 
 Quality = Literal["draft", "normal", "high"]
-RECORDINGS = ("RGBDFolder", "TUM")  # their measured poses fit their depth better than bundle adjustment does
-
-
-def is_recording(scene: Scene) -> bool:
-    """Returns whether a scene comes from a recording with measured depth and poses."""
-    return scene.cameras_from.startswith(RECORDINGS)
+Refinement = bool | int | RefineOptions | None
+"""Whether and how a scene is refined: by the policy (True), never (False or 0), for a number of steps at the working
+size, with given options, or None: if :func:`refined_by_default`."""
 
 
 def refined_by_default(scene: Scene) -> bool:
     """Returns whether ``vg2gt reconstruct`` refines a scene without being told: up to 100 photographs."""
-    return not is_recording(scene) and len(scene.names) <= AUTOMATIC
+    return scene.camera_source is not CameraSource.RECORDED and len(scene.names) <= AUTOMATIC
 
 
 def refinement_for(
@@ -47,16 +45,40 @@ def refinement_for(
         ValueError: if an override or the quality is unknown.
     """
     check_choice("quality", quality, Quality)
-    name = "default" if is_recording(scene) else {"normal": "photographs"}.get(quality, quality)
+    recorded = scene.camera_source is CameraSource.RECORDED
+    name = "default" if recorded else {"normal": "photographs"}.get(quality, quality)
     found = read_options(name, overrides)
     given: dict[str, Any] = {key: value for key, value in changes.items() if value is not None}
-    if not overrides and not scene.cameras_from:
+    if not overrides and scene.camera_source is CameraSource.PREDICTED:
         found = replace(found, rates=replace(found.rates, cameras=RefineRates().cameras))
     if not scene.pictures:  # only the working size can be refined
         found = replace(found, full=None)
     if "seconds" in given and found.full is None:
         given = {"steps": None, **given}
     return replace(found, **given)
+
+
+def chosen_refinement(
+    scene: Scene, refine: Refinement = None, quality: Quality = "normal", overrides: Sequence[str] = ()
+) -> RefineOptions | None:
+    """Returns the options of a scene's refinement, None if it is not to be refined.
+
+    Args:
+        scene: the scene.
+        refine: whether and how (:data:`Refinement`); None with overrides refines.
+        quality: see :func:`refinement_for`.
+        overrides: see :func:`refinement_for`.
+
+    Raises:
+        ValueError: if an override or the quality is unknown.
+    """
+    if isinstance(refine, RefineOptions):
+        return refine
+    if refine is None:
+        refine = bool(overrides) or refined_by_default(scene)
+    if refine is True:
+        return refinement_for(scene, quality, overrides)
+    return replace(refinement_for(scene, quality, overrides, steps=refine), full=None) if refine else None
 
 
 def read_options(name: str, overrides: Sequence[str]) -> RefineOptions:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from vg2gt.monitor import Monitor
 from vg2gt.reconstruction.photographs import load_photographs
+from vg2gt.reconstruction.policy import Quality, Refinement, chosen_refinement
 from vg2gt.reconstruction.surroundings import without_debris
 from vg2gt.refinement import Observations, RefineOptions, exposure_rates, fold_of, refine, sharpened, split_views
 
@@ -48,16 +49,28 @@ def refine_scene(
     if full is not None and options.seconds is not None:
         at_working_size = replace(options, seconds=WORKING_SHARE * options.seconds)
     fold = None if full is None else fold_of(split_views(len(scene.names), options.holdout)[0], full)
-    with monitor.stage("refine", 100) as advance:
+    with monitor.stage("refine", 100, " %") as advance:
         observe = _shown(advance)
         refined = refine(scene.gaussians, scene.cameras, seen, scene.renderer, at_working_size, observe, clock, fold)
     if full is not None and refined.ended in ("steps", "seconds"):
         photographs = load_photographs(scene.pictures, refined.scene.cameras, full.size, monitor).to(device)
         left = None if options.seconds is None else max(0.0, options.seconds - (clock() - began))
-        with monitor.stage("refine at full size", 100) as advance:
+        with monitor.stage("refine at full size", 100, " %") as advance:
             refined = sharpened(refined, photographs, seen, scene.renderer, options, left, _shown(advance), clock)
     made = replace(scene, gaussians=refined.scene.gaussians, cameras=refined.scene.cameras, refined=refined)
     return without_debris(made)
+
+
+def refined_by_policy(
+    scene: Scene,
+    refine: Refinement = None,
+    quality: Quality = "normal",
+    overrides: Sequence[str] = (),
+    monitor: Monitor | None = None,
+) -> Scene:
+    """Refines a scene if :func:`vg2gt.reconstruction.policy.chosen_refinement` says so; arguments as there."""
+    options = chosen_refinement(scene, refine, quality, overrides)
+    return scene if options is None else refine_scene(scene, options, monitor)
 
 
 def _shown(advance: Callable[..., None]) -> Callable[[int, float, float], None]:
@@ -117,6 +130,9 @@ def refinement_lines(scene: Scene) -> list[str]:
     if (sharp := refined.sharpened) is not None and sharp.scores:
         lines.append(_judged(sharp.scores[-1], len(sharp.fold)))
     before, after = len(refined.start.gaussians), len(refined.scene.gaussians)
-    ended = {"interrupted": ", interrupted", "diverged": ", stopped because it diverged"}.get(refined.ended, "")
-    lines.append(f"best state: step {refined.step} of {refined.steps}{ended}; Gaussians: {before} -> {after}")
+    ended = {"interrupted": " (interrupted)", "diverged": " (stopped because it diverged)"}.get(refined.ended, "")
+    kept = f"; the scene after step {refined.step} was the best and is kept" if refined.step < refined.steps else ""
+    if refined.step == 0:
+        kept = "; no step was better than the scene before, which is kept"
+    lines.append(f"refined for {refined.steps} steps{ended}{kept}; Gaussians: {before} -> {after}")
     return lines

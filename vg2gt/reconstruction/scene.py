@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from vg2gt.geometry.cameras import unproject
+from vg2gt.inputs.camera_source import CameraSource
 from vg2gt.inputs.inputs import photo_of
 from vg2gt.inputs.pictures import Picture
 from vg2gt.io.cameras_json import NamedCamera, named_cameras
@@ -22,6 +23,9 @@ from vg2gt.refinement import Refined, RefineOptions
 from vg2gt.rendering import Renderer
 from vg2gt.types import Cameras, Gaussians
 from vg2gt.visibility import point_support
+
+if TYPE_CHECKING:
+    from vg2gt.reconstruction.policy import Quality
 
 POINTS = 100_000
 
@@ -62,7 +66,7 @@ class ScenePoints:
 
 @dataclass(frozen=True)
 class Scene:
-    """The result of :func:`vg2gt.reconstruct`.
+    """A reconstructed scene, as :meth:`vg2gt.api.Pipeline.reconstruct` returns it.
 
     The world frame and unit are those of the given cameras, or else the reference camera turned upright (x right, y
     down, z forward), with a median depth of about 1.
@@ -102,6 +106,11 @@ class Scene:
     poses: Tensor | None = None
     error: Tensor | None = None
     support: Tensor | None = None
+
+    @property
+    def camera_source(self) -> CameraSource:
+        """Kind of origin of the cameras."""
+        return CameraSource.of(self.cameras_from)
 
     @cached_property
     def gaussian_trust(self) -> dict[str, Tensor] | None:
@@ -161,31 +170,47 @@ class Scene:
         colors = (self.images.permute(0, 2, 3, 1)[grid][keep] * 255 + 0.5).to(torch.uint8)
         return ScenePoints(world[grid][keep].numpy(), colors.numpy(), keep.nonzero()[:, 0].numpy())
 
-    def refine(self, options: RefineOptions | None = None, **changes: Any) -> Scene:
+    def refine(self, options: RefineOptions | None = None, quality: Quality = "normal", **changes: Any) -> Scene:
         """Optimises Gaussians and cameras on the scene's own images (:func:`vg2gt.refinement.refine`).
 
         Args:
-            options: options of the refinement; default :class:`vg2gt.refinement.RefineOptions`, which suits RGB-D
-                recordings. ``configs/refine/photographs.yaml`` lists those that the command uses for photos.
+            options: options of the refinement; None: those of the scene's kind of input, as ``vg2gt refine`` chooses
+                them (:func:`vg2gt.reconstruction.policy.refinement_for`).
+            quality: how long photographs are refined, if no options are given.
             **changes: options to override, such as ``steps=50`` or ``holdout=8``.
 
         Returns:
             The refined scene; this one is not changed.
         """
+        from vg2gt.reconstruction.policy import refinement_for
         from vg2gt.reconstruction.refined import refine_scene
 
-        return refine_scene(self, replace(options or RefineOptions(), **changes))
+        return refine_scene(self, replace(options or refinement_for(self, quality, **changes), **changes))
 
-    def save(self, folder: str | Path, outputs: Sequence[str] = ("scene.ply", "cameras.json", "report.png")) -> None:
+    def save(
+        self,
+        folder: str | Path,
+        outputs: Sequence[str] = ("scene.ply", "cameras.json", "report.png"),
+        *,
+        overwrite: bool = False,
+    ) -> Path:
         """Writes outputs into a folder; :data:`vg2gt.outputs.output_names.OUTPUTS` lists them.
 
+        Args:
+            folder: output folder, created if missing.
+            outputs: names of the outputs. ``scene.html`` is a page that shows the scene in a browser.
+            overwrite: replace existing outputs.
+
+        Returns:
+            The folder.
+
         Raises:
-            FileExistsError: if an output exists.
+            FileExistsError: if an output exists and ``overwrite`` is false.
             ValueError: if an output is unknown.
         """
         from vg2gt.outputs.outputs import write_outputs
 
-        write_outputs(self, folder, outputs)
+        return write_outputs(self, folder, outputs, overwrite=overwrite)
 
 
 @torch.no_grad()

@@ -17,6 +17,13 @@ if TYPE_CHECKING:
     from vg2gt.reconstruction.scene import Scene
 
 NAMES = {kind.name.lower(): kind for kind in Status}
+_DOUBTS = {
+    "single": "were seen by one view only (single)",
+    "guessed": "fill places without measured depth (guessed)",
+    "contradicted": "contradict other views (contradicted)",
+    "unseen": "are seen by no view (unseen)",
+}
+_FEW = 0.5  # share of confirmed Gaussians below which the summary gives advice; a round number, not tuned
 _COLORS = torch.tensor([[0.15, 0.15, 0.15], [0.45, 0.45, 0.45], [0.75, 0.1, 0.55]])  # unseen, guessed, contradicted
 _RAMP = torch.tensor([[0.1, 0.3, 0.75], [0.2, 0.7, 0.5], [0.95, 0.85, 0.2], [0.85, 0.2, 0.1]])
 _RAMP_ENDS = (0.003, 0.3)  # errors at its ends, logarithmic in between
@@ -105,17 +112,23 @@ def trust_figures(scene: Scene) -> dict[str, Any]:
     return {"trust": figures}
 
 
-def trust_line(scene: Scene) -> str:
-    """Returns a one-line summary for a terminal."""
+def trust_lines(scene: Scene) -> list[str]:
+    """Returns sentences for a terminal: which part of a scene is confirmed, its depth errors, and what may help."""
     figures = trust_figures(scene).get("trust")
     if figures is None:
-        return "support of the Gaussians is unknown for scenes made in windows"
-    shares = ", ".join(f"{100 * share:.0f} % {name}" for name, share in figures["gaussians"].items() if share >= 0.005)
-    shares += " (agreed: two or more views see it at the same depth)"
+        return ["how many views confirm a Gaussian is not known for scenes made in windows"]
+    shares = figures["gaussians"]
+    rest = [f"{100 * shares[name]:.0f} % {said}" for name, said in _DOUBTS.items() if shares[name] >= 0.005]
+    lines = [f"Gaussians: {100 * shares['agreed']:.0f} % are confirmed by two or more views"]
+    if rest:
+        lines[0] += f"; {', '.join(rest)}; --drop removes what you name"
+    if shares["agreed"] < _FEW:
+        lines.append("few views agree: take more photographs in smaller steps, or check that the cameras are right")
     if "error_of_pixels" not in figures:
-        return f"Gaussians: {shares}; errors are not stated (no calibration of this model)"
-    error = 100 * figures["error_of_pixels"]
-    return f"Gaussians: {shares}; depth of the median pixel within {error:.2g} % ({100 * STATED:.0f} % sure)"
+        return [*lines, "depth errors are not stated: there is no calibration of this model (vg2gt calibrate)"]
+    when = "depth before refinement" if scene.refined is not None else "depth"
+    error, sure = 100 * figures["error_of_pixels"], round(10 * STATED)
+    return [*lines, f"{when}: for half of the pixels, the error stays below {error:.2g} % in {sure} of 10 cases"]
 
 
 def trust_picture(error: Tensor | None, support: Tensor) -> Tensor:

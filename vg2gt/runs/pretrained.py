@@ -8,7 +8,7 @@ from pathlib import Path
 
 from vg2gt.io.files import write_bytes, write_text
 from vg2gt.runs.checkpoints import MADE_OF, checkpoint_path, read_checkpoint, write_slim
-from vg2gt.runs.load import SHIPPED, LoadedModel, calibration_path, load_model
+from vg2gt.runs.load import SHIPPED, calibration_path
 
 WEIGHTS, CONFIG = "model.safetensors", "model.yaml"
 CALIBRATION = calibration_path(Path(WEIGHTS)).name
@@ -17,32 +17,8 @@ MODELS = {"sweep-tiny": SHIPPED}
 
 
 def list_models() -> tuple[str, ...]:
-    """Returns the names of the models that ship with the package, for :func:`from_pretrained`."""
+    """Returns the names of the models that ship with the package, for :func:`vg2gt.load`."""
     return tuple(MODELS)
-
-
-def from_pretrained(
-    name: str | Path, *, backend: str | None = None, revision: str | None = None, device: str = "auto"
-) -> LoadedModel:
-    """Loads a trained model by name.
-
-    Args:
-        name: one of :func:`list_models`, a folder written by :func:`save_pretrained`, a run's folder or checkpoint, or
-            ``OWNER/NAME`` of a model on the Hub.
-        backend: name of a backend, see :func:`vg2gt.load_model`.
-        revision: revision of a model on the Hub.
-        device: ``auto``, ``cpu``, ``cuda`` or ``cuda:N``.
-
-    Returns:
-        The model in eval mode, its renderer and the origin of its weights.
-
-    Raises:
-        FileNotFoundError: if there is no such file or folder.
-        OSError: if there is no such repository on the Hub.
-        ImportError: if it is on the Hub and huggingface_hub is not installed.
-        ValueError: if it was trained on another backbone, or its files are damaged.
-    """
-    return load_model(_weights(name, revision), backend, device=device)
 
 
 def save_pretrained(ckpt: str | Path, folder: str | Path) -> Path:
@@ -96,7 +72,8 @@ def push_to_hub(ckpt: str | Path, repo: str, folder: str | Path, private: bool =
     return str(api.upload_folder(repo_id=repo, folder_path=str(saved), allow_patterns=[WEIGHTS, CONFIG, CALIBRATION]))
 
 
-def _weights(name: str | Path, revision: str | None) -> Path:
+def weights_file(name: str | Path, revision: str | None = None) -> Path:
+    """Returns the weights of a model by name, downloaded if it is on the Hub; arguments as for :func:`vg2gt.load`."""
     if str(name) in MODELS:
         return MODELS[str(name)]
     path = Path(name).expanduser()

@@ -110,7 +110,7 @@ def _pictures_of_views(cameras: Sequence[NamedCamera], path: Path) -> list[NDArr
         stored = read_npz(path, ["names", "images"])
         images = dict(zip(stored["names"].tolist(), stored["images"], strict=True))
         found = [images.get(camera.name.removesuffix(".png")) for camera in cameras]
-        return [None if image is None else _thumbnail(Image.fromarray(image)) for image in found]
+        return [None if image is None else thumbnail(image) for image in found]
     except Exception as error:  # damaged archives and arrays that are no images
         raise ValueError(f"cannot read {path}: {error}; restore or remove it") from error
 
@@ -119,11 +119,13 @@ def _picture(path: Path) -> NDArray[np.uint8]:
     try:
         with open_image(path) as image:
             image.draft("RGB", (2 * PICTURE_SIDE, 2 * PICTURE_SIDE))  # JPEG decodes to a smaller size
-            return _thumbnail(color_image(ImageOps.exif_transpose(image) or image))
+            return thumbnail(np.asarray(color_image(ImageOps.exif_transpose(image) or image)))
     except Exception as error:  # image libraries raise many kinds of errors
         raise ValueError(f"cannot read {path}: {error}; restore or remove the image") from error
 
 
-def _thumbnail(image: Image.Image) -> NDArray[np.uint8]:
+def thumbnail(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Returns an image ``[H, W, 3]`` uint8 reduced to at most ``PICTURE_SIDE`` pixels on its longer side."""
+    image = Image.fromarray(pixels)
     image.thumbnail((PICTURE_SIDE, PICTURE_SIDE))
     return np.array(image)
