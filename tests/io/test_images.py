@@ -99,3 +99,42 @@ def test_photographs_without_a_known_white_are_refused(tmp_path: Path, dtype: ty
     Image.fromarray(RAMP.astype(dtype)).save(tmp_path / "photo.tif")
     with pytest.raises(DataError, match=rf"photo\.tif of scene room: .* a photograph of {kind} is unknown"):
         read_color(tmp_path / "photo.tif", "room")
+
+
+@pytest.mark.parametrize("kind", ["jpg", "png", "rgba.png", "grey.jpg"])
+@pytest.mark.parametrize("size", [(160, 240), (157, 243)])
+def test_large_images_are_reduced_while_they_are_read(tmp_path: Path, kind: str, size, monkeypatch) -> None:
+    """The whole of the image, turned upright, and never less than twice what suffices."""
+    monkeypatch.setattr("vg2gt.io.image_files._LARGE", 10_000)
+    height, width = size
+    y, x = np.mgrid[:height, :width]
+    smooth = np.stack((x * 250 / width, y * 250 / height, np.full(size, 80)), -1).astype(np.uint8)
+    image = Image.fromarray(smooth)
+    image = {"rgba.png": image.convert("RGBA"), "grey.jpg": image.convert("L")}.get(kind, image)
+    exif = Image.Exif()
+    exif[0x0112] = 6  # to be turned clockwise
+    image.transpose(Image.Transpose.ROTATE_90).save(tmp_path / f"a.{kind}", quality=98, subsampling=0, exif=exif)
+    whole = read_color(tmp_path / f"a.{kind}", "", upright=True)
+    assert whole.shape == (*size, 3)
+    for least, factor in (((30, 40), 2), ((18, 25), 4), ((9, 14), 8), ((90, 130), 1)):
+        found = read_color(tmp_path / f"a.{kind}", "", upright=True, least=least)
+        shape = (round(height / factor), round(width / factor))
+        assert found.shape == (*shape, 3)
+        assert found.shape[0] >= 2 * least[0] or factor == 1
+        wanted = Image.fromarray(whole).resize(shape[::-1], Image.Resampling.BOX)
+        inner = np.abs(found.astype(int) - np.asarray(wanted))[1:-1, 1:-1]
+        assert inner.mean() < 1
+        assert inner.max() < 6
+    monkeypatch.setattr("vg2gt.io.image_files._LARGE", 10**6)
+    assert read_color(tmp_path / f"a.{kind}", "", upright=True, least=(18, 25)).shape == whole.shape
+
+
+def test_images_of_up_to_300_megapixels_are_opened(tmp_path: Path, monkeypatch) -> None:
+    """Pillow alone refuses 179 million and warns from 89 million."""
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 50)
+    Image.new("RGB", (40, 20)).save(tmp_path / "a.jpg")
+    assert image_size(tmp_path / "a.jpg", "") == (20, 40)
+    assert Image.MAX_IMAGE_PIXELS == 50
+    monkeypatch.setattr("vg2gt.io.images.MOST_PIXELS", 799)
+    with pytest.raises(DataError, match="has 40x20 pixels, more than"):
+        image_size(tmp_path / "a.jpg", "")

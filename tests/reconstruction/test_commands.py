@@ -103,10 +103,10 @@ def test_names_of_views_that_cannot_be_files(scene: Scene, tmp_path: Path) -> No
     [
         ("nowhere", "nowhere does not exist"),
         ("empty", "no images in .*empty"),
-        ("note.txt", r"cannot read \S*note\.txt: .*restore the file or leave it out"),
+        ("note.txt", r"the only image \S*note\.txt cannot be read \(cannot identify"),
         ("bare.r3d", r"bare\.r3d holds no images"),
         ("note.r3d", r"note\.r3d: not a readable archive"),
-        ("broken.png", "cannot read .*broken.png"),
+        ("broken.png", r"the only image \S*broken\.png cannot be read"),
     ],
 )
 def test_what_holds_no_images_is_told_before_the_weights_are_loaded(tmp_path: Path, name: str, said: str) -> None:

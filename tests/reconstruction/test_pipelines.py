@@ -76,14 +76,16 @@ def test_cameras_are_found_where_people_have_them(folder: Path, frames, layout: 
     assert torch.allclose(pictures[0].read(SIZE).world_to_camera[0], frames.world_to_camera[0], atol=1e-5)
 
 
-def test_a_model_that_cannot_be_read_is_said_where_others_are_found(model, folder: Path, frames, caplog, monkeypatch):
+def test_cameras_that_cannot_be_read_are_no_reason_to_look_for_others(model, folder: Path, frames, monkeypatch):
+    """Structure from motion takes minutes: only if it is asked for."""
     put_colmap(folder, frames)
     path = folder / "sparse" / "0" / "images.bin"
     path.write_bytes(path.read_bytes()[:100])
     monkeypatch.setattr("vg2gt.inputs.cameras.find_cameras", lambda pictures, *_: pictures)
-    with pictures_for(model, folder):
-        assert "cannot use the camera files, running structure from motion instead:" in caplog.text
-        assert "images.bin" in caplog.text
+    with pytest.raises(ValueError, match=r"images\.bin.*--poses sfm ignores them"), pictures_for(model, folder):
+        pass
+    with pictures_for(model, folder, "sfm") as pictures:
+        assert len(pictures) == len(NAMES)
     with pytest.raises(ValueError, match=r"images\.bin"), pictures_for(model, folder, "given"):
         pass
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import logging
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -20,11 +19,10 @@ from vg2gt.inputs.pictures import (
     without_copies,
 )
 from vg2gt.inputs.sfm import find_cameras, require_pycolmap
+from vg2gt.inputs.usable import usable_pictures
 from vg2gt.io.files import by_number
 from vg2gt.model import Reconstructor
 from vg2gt.monitor import Monitor
-
-log = logging.getLogger(__name__)
 
 Poses = Literal["auto", "given", "sfm"]
 
@@ -53,7 +51,8 @@ def pictures_for(
         monitor: shows and times the stages.
 
     Yields:
-        The pictures; of identical files, only the first.
+        The pictures; of identical files, only the first. Those that show nothing are left out
+        (:func:`~vg2gt.inputs.usable.usable_pictures`).
 
     Raises:
         FileNotFoundError: if a path does not exist.
@@ -70,19 +69,15 @@ def pictures_for(
         )
     if poses == "sfm" and backend.needs_depth:
         raise ValueError(f"backend {backend.name} works from the depth and poses of a recording; leave --poses out")
+    monitor = monitor or Monitor()
     if not backend.needs_hints:
-        yield without_copies(find_pictures(images, max_images))
+        yield usable_pictures(without_copies(find_pictures(images, max_images)), monitor)
         return
     given = None
     if poses != "sfm":
-        try:
-            given = given_pictures(images, max_images, depth=backend.needs_depth)
-        except DataError as error:
-            if poses == "given" or backend.needs_depth:
-                raise
-            log.warning("cannot use the camera files, running structure from motion instead: %s", error)
+        given = _given_pictures(images, max_images, backend.needs_depth, poses)
     if given is not None:
-        yield without_copies(given)
+        yield usable_pictures(without_copies(given), monitor)
         return
     if backend.needs_depth:
         raise ValueError(_no_depth(backend.name, images))
@@ -91,11 +86,11 @@ def pictures_for(
             f"no cameras next to {describe(images)}: expected {LAYOUTS}; --poses sfm finds them from the images"
         )
     with tempfile.TemporaryDirectory(prefix="vg2gt-sfm-") as temporary:
-        pictures = without_copies(find_pictures(images, max_images))
+        pictures = usable_pictures(without_copies(find_pictures(images, max_images)), monitor)
         place = {picture.name: number for number, picture in enumerate(pictures)}
         if all(picture.path is not None for picture in pictures):  # so that the order of the files does not matter
             pictures = sorted(pictures, key=lambda picture: by_number(str(picture.path)))
-        found = find_cameras(pictures, Path(sfm_folder or f"{temporary}/sfm"), monitor or Monitor())
+        found = find_cameras(pictures, Path(sfm_folder or f"{temporary}/sfm"), monitor)
         yield sorted(found, key=lambda picture: place[picture.name])
 
 
@@ -118,6 +113,19 @@ def check_inputs(backend: type, images: Sequence[str], poses: Poses) -> None:
     needed = poses == "sfm" or getattr(backend, "needs_cameras", False)
     if needed and importlib.util.find_spec("pycolmap") is None and (poses == "sfm" or given_pictures(images) is None):
         require_pycolmap()
+
+
+def _given_pictures(images: ImagesLike, max_images: int | None, depth: bool, poses: Poses) -> list[Picture] | None:
+    """Returns :func:`given_pictures`; its errors name ``--poses sfm`` where structure from motion is a way out."""
+    try:
+        return given_pictures(images, max_images, depth=depth)
+    except DataError as error:
+        if poses == "given" or depth:
+            raise
+        raise DataError(
+            f"cannot use the camera files of {describe(images)}: {error}; --poses sfm ignores them and finds the "
+            "cameras from the images"
+        ) from error
 
 
 def _no_depth(backend: str, images: ImagesLike) -> str:

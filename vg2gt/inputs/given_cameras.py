@@ -16,11 +16,11 @@ from vg2gt.data.base import DataError, Frames
 from vg2gt.data.sources.colmap_model import COLMAP, model_folder_of
 from vg2gt.data.sources.files import FileSource
 from vg2gt.data.sources.nerfstudio import Nerfstudio, transforms_files
-from vg2gt.data.sources.parsing import IMAGE_SUFFIXES
 from vg2gt.data.sources.phone import app_of
 from vg2gt.data.sources.rgbd import RGBDFolder
 from vg2gt.data.sources.undistortion import size_on_disk, undistortion_of
 from vg2gt.geometry.cameras import resize_intrinsics
+from vg2gt.inputs.folders import image_files, image_folders, is_photo
 from vg2gt.inputs.pictures import (
     UNKNOWN_LENS,
     ImagesLike,
@@ -29,14 +29,14 @@ from vg2gt.inputs.pictures import (
     evenly,
     existing_path,
     frame_of,
-    image_files,
-    image_folders,
     mask_for,
+    name_left_out,
+    reason_of,
     shrunk,
     with_unique_names,
 )
 from vg2gt.io.cameras_json import NamedCamera, Photo, read_cameras_json
-from vg2gt.io.image_files import read_color
+from vg2gt.io.image_files import is_damaged, read_color
 from vg2gt.io.nerfstudio import read_transforms
 from vg2gt.io.record3d import R3D
 
@@ -88,6 +88,7 @@ def recording_pictures(source: FileSource) -> list[Picture]:
     if len(source.scenes) > 1:
         raise ValueError(f"there are {len(source.scenes)} recordings; give one of them: {', '.join(source.scenes)}")
     scene = source.scenes[0]
+    source.leave_out_damaged = True
     index = source.scene_index(scene)
     metric = source.is_metric or (isinstance(source, RGBDFolder) and (index.folder / "depth").is_dir())
     recorded = metric or not isinstance(source, RGBDFolder) or app_of(index.folder) is not None
@@ -97,7 +98,7 @@ def recording_pictures(source: FileSource) -> list[Picture]:
         """Returns a frame as a picture that is read on demand."""
 
         def read(size: tuple[int, int]) -> Frames:
-            return source.load_whole(scene, frame)
+            return source.load_whole(scene, frame, size)
 
         row = index.row(frame)
         color = index.color[row]
@@ -108,7 +109,7 @@ def recording_pictures(source: FileSource) -> list[Picture]:
             kind,
             source.has_depth,
             source.point_depths(scene, frame) if isinstance(source, COLMAP) else None,
-            path=color if color.is_file() and color.suffix.lower() in IMAGE_SUFFIXES else None,
+            path=color if color.is_file() and is_photo(color) else None,
             pose=index.world_to_camera[row],
             intrinsics=index.intrinsics[row],
             is_metric=metric,
@@ -149,20 +150,36 @@ def _given(folder: Path, depth: bool) -> list[Picture] | None:
     if folder.is_dir():
         places.append((folder.resolve().parent, folder.resolve().name))
     for place, images in places:
-        pictures, above = None, place == folder.resolve().parent and place != folder
+        above = place == folder.resolve().parent and place != folder
         if above and not _may_be_of(place, folder.resolve()):
             continue
-        if not depth and (place / _CAMERAS).is_file():
-            pictures = _from_cameras_json(place / _CAMERAS, place / images)
-        source = None if pictures is not None else _source(place, images, depth)
-        if source is not None and not (above and isinstance(source, RGBDFolder) and len(source.scenes) > 1):
-            pictures = recording_pictures(source)
+        try:
+            pictures, others = _at(place, images, depth, above)
+        except DataError as error:
+            if not above:
+                raise
+            log.warning("cannot use the camera files in the folder above the images: %s", error)
+            continue
         if pictures is not None and above:  # the cameras may be those of other photographs
             pictures = [each for each in pictures if each.path and _is_in(each.path, folder.resolve())] or None
         if pictures is not None:
-            _name_missing(pictures, place / images)
+            _name_missing(pictures, place / images, others)
             return pictures
     return None
+
+
+def _at(place: Path, images: str, depth: bool, above: bool) -> tuple[list[Picture] | None, set[Path]]:
+    """Returns the pictures with the cameras in a folder, and further files that belong to these, such as depth."""
+    if not depth and (place / _CAMERAS).is_file():
+        pictures = _from_cameras_json(place / _CAMERAS, place / images)
+        if pictures is not None:
+            return pictures, set()
+    source = _source(place, images, depth)
+    if source is None or (above and isinstance(source, RGBDFolder) and len(source.scenes) > 1):
+        return None, set()
+    pictures = recording_pictures(source)
+    index = source.scene_index(source.scenes[0])
+    return pictures, {file.resolve() for file in (*index.color, *index.depth)}
 
 
 def _may_be_of(place: Path, folder: Path) -> bool:
@@ -195,15 +212,16 @@ def _source(folder: Path, images: str, depth: bool) -> FileSource | None:
     return RGBDFolder(str(folder), holdout=None, depth=has_depth)
 
 
-def _name_missing(pictures: list[Picture], folder: Path) -> None:
-    """Warns about images of a folder that have no camera."""
+def _name_missing(pictures: list[Picture], folder: Path, others: set[Path]) -> None:
+    """Warns about images of a folder, except ``others``, that have no camera."""
     known = {picture.path.resolve() for picture in pictures if picture.path is not None}
     try:
         files = image_files(folder)
     except (ValueError, OSError):  # the pictures are elsewhere, such as in an archive
         return
     if any(file.resolve() in known for file in files):
-        _name_left_out([file.name for file in files if file.resolve() not in known], pictures[0].source)
+        missing = [file for file in files if file.resolve() not in known | others]
+        _name_left_out([str(file.relative_to(folder)) for file in missing], pictures[0].source)
 
 
 def _name_left_out(names: Sequence[str], where: str) -> None:
@@ -241,7 +259,17 @@ def _from_cameras_json(path: Path, folder: Path) -> list[Picture] | None:
     ):
         log.warning("%s describes undistorted images and is ignored for the photos in %s", path, folder)
         return None
-    return [_photo(file, camera, path) for file, camera in known]
+    faults: dict[str, str] = {}
+    pictures = []
+    for file, camera in known:
+        try:
+            pictures.append(_photo(file, camera, path))
+        except DataError as error:
+            if not is_damaged(file):
+                raise
+            faults[str(file)] = reason_of(error)
+    name_left_out(faults, len(known))
+    return pictures
 
 
 def _photo(path: Path, camera: NamedCamera, cameras: Path) -> Picture:
@@ -257,12 +285,13 @@ def _photo(path: Path, camera: NamedCamera, cameras: Path) -> Picture:
 
     def read(wanted: tuple[int, int]) -> Frames:
         """Reads the undistorted photograph with its mask and camera, reduced to about the wanted size."""
-        pixels = read_color(path, path.parent.name, upright=upright)
+        pixels = read_color(path, path.parent.name, upright=upright, least=wanted)
         mask = mask_for(path, upright)
         if undistortion is None:
             frames = frame_of(shrunk(pixels, wanted), mask)
         else:
-            frames = frame_of(undistortion.color(pixels), None if mask is None else undistortion.depth(mask))
+            reduced = undistortion.reduced((pixels.shape[0], pixels.shape[1]))
+            frames = frame_of(reduced.color(pixels), None if mask is None else undistortion.depth(mask))
         height, width = frames.images.shape[-2:]
         matrix = resize_intrinsics(intrinsics, width / photo.width, height / photo.height)
         return replace(frames, world_to_camera=pose.float()[None], intrinsics=matrix.float()[None])

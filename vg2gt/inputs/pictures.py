@@ -7,7 +7,7 @@ import importlib.util
 import itertools
 import logging
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -20,18 +20,19 @@ from torch import Tensor
 
 from vg2gt.data.base import Frames
 from vg2gt.data.sources.masks import FOLDER as MASKS
-from vg2gt.data.sources.masks import (
-    IMAGE_FOLDERS,
-    is_image_folder,
-    joined_masks,
-    mask_beside,
-    resized_mask,
-    warn_without_mask,
-)
-from vg2gt.data.sources.parsing import IMAGE_SUFFIXES
+from vg2gt.data.sources.masks import joined_masks, mask_beside, resized_mask, warn_without_mask
 from vg2gt.data.transforms import from_bytes, to_bytes
-from vg2gt.io.files import by_number
-from vg2gt.io.image_files import focal_length, image_size, is_panorama, read_color, read_mask, read_mask_file
+from vg2gt.inputs.folders import HEIC_SUFFIXES, PHOTO_SUFFIXES, image_files, is_photo, name_passed_over
+from vg2gt.io.errors import DataError
+from vg2gt.io.image_files import (
+    focal_length,
+    image_size,
+    is_damaged,
+    is_panorama,
+    read_color,
+    read_mask,
+    read_mask_file,
+)
 from vg2gt.io.images import color_image, has_alpha
 from vg2gt.io.record3d import R3D, is_archive, read_recorded, recorded_files
 from vg2gt.io.video import VIDEO_SUFFIXES, VideoFrames, count_frames, read_video, require_pyav, video_size
@@ -40,8 +41,7 @@ log = logging.getLogger(__name__)
 
 ImagesLike: TypeAlias = "str | Path | Image.Image | NDArray[Any] | Tensor | Sequence[Any]"
 
-HEIC_SUFFIXES = (".heic", ".heif")
-_HOLDS_PICTURES = (*IMAGE_SUFFIXES, *HEIC_SUFFIXES, R3D)
+_HOLDS_PICTURES = (*PHOTO_SUFFIXES, R3D)
 VIDEO_FRAMES = 32  # frames taken from a video by default
 IN_MEMORY = 100  # maximum number of video frames kept in memory; with more, each is decoded on demand
 SFM_SOURCE = "structure from motion"  # prefix of the source of cameras found by it
@@ -93,13 +93,15 @@ def find_pictures(images: ImagesLike, max_images: int | None = None) -> list[Pic
         max_images: maximum number of pictures, evenly spread; None: all, but 32 frames of a video.
 
     Returns:
-        The pictures in order, with unique names.
+        The pictures in order, with unique names. Files that are no images are left out, named in a warning.
 
     Raises:
         FileNotFoundError: if a path does not exist.
-        ValueError: if there is no picture (the message names where was searched), or a file cannot be read.
+        ValueError: if there is no picture (the message names where was searched), or none can be read.
     """
-    chosen = [picture for item in as_items(images) for picture in _pictures(item, max_images)]
+    faults: dict[str, str] = {}
+    chosen = [picture for item in as_items(images) for picture in _pictures(item, max_images, faults)]
+    name_left_out(faults, len(chosen) + len(faults))
     if not chosen:
         raise ValueError("there are no images to reconstruct; give image files, a folder of them, or a video")
     taken = evenly(chosen, max_images)
@@ -119,11 +121,15 @@ def check_pictures(paths: Sequence[str]) -> None:
         ImportError: if a video needs a package that is not installed.
         ValueError: if there is no picture, or a file is not a picture.
     """
-    for path in map(existing_path, paths):
+    found = [existing_path(path) for path in paths]
+    files = [path for path in found if path.is_file() and path.suffix.lower() not in VIDEO_SUFFIXES]
+    if len(files) == len(found) and all(map(is_damaged, files)):
+        find_pictures(files)
+    for path in found:
         if path.suffix.lower() in VIDEO_SUFFIXES:
             require_pyav(f"reading {path}")
         elif path.is_file():
-            _pictures(path, 1)
+            _allow_heic(path)
         elif not any(file.suffix.lower() in _HOLDS_PICTURES for file in path.rglob("*")):
             image_files(path)
 
@@ -192,60 +198,79 @@ def mask_for(path: Path, upright: bool = True, content: bytes | None = None) -> 
     return joined_masks(parts)
 
 
-def _pictures(item: Any, max_images: int | None) -> list[Picture]:
+def _pictures(item: Any, max_images: int | None, faults: dict[str, str]) -> list[Picture]:
+    """Returns the pictures of an item; adds what is wrong with files that cannot be read to ``faults``, by path."""
     if not isinstance(item, (str, Path)):
         return _from_memory(item)
     path = existing_path(item)
     if path.is_dir():
-        return [_photo(file) for file in image_files(path)]
+        files = image_files(path)
+        name_passed_over(path)
+        return _photos(files, faults)
     if is_archive(path):
         files = recorded_files(path, ".jpg")
         if not files:
             raise ValueError(f"{path} holds no images (rgbd/0.jpg and so on): is it a recording of Record3D?")
         return [_photo(file, read_recorded) for file in files.values()]
-    return _video(path, max_images or VIDEO_FRAMES) if path.suffix.lower() in VIDEO_SUFFIXES else [_photo(path)]
+    return (
+        _video(path, max_images or VIDEO_FRAMES) if path.suffix.lower() in VIDEO_SUFFIXES else _photos([path], faults)
+    )
 
 
-def image_files(folder: Path) -> list[Path]:
-    """Lists the images of a folder, or of its image subfolder if that has more, sorted by the numbers in their names.
+def _photos(files: Sequence[Path], faults: dict[str, str]) -> list[Picture]:
+    found = []
+    for file in files:
+        try:
+            found.append(_photo(file))
+        except DataError as error:
+            faults[str(file)] = reason_of(error)
+    return found
+
+
+def reason_of(error: DataError) -> str:
+    """Returns why an image cannot be read, without its name."""
+    return f"cannot be read ({error.__cause__ or error})"
+
+
+def name_left_out(faults: Mapping[str, str], count: int) -> None:
+    """Warns about images that are left out.
+
+    Args:
+        faults: what is wrong with each, by name, such as "is black".
+        count: number of all images.
 
     Raises:
-        ValueError: if there are none.
+        DataError: if no image is left.
     """
-    places = [folder, *image_folders(folder)]
-    found = {place: [file for file in place.iterdir() if _is_image(file) and file.is_file()] for place in places}
-    taken = max(places, key=lambda place: len(found[place]))  # the first of equals
-    if not found[taken]:
-        suffixes = ", ".join((*IMAGE_SUFFIXES, *HEIC_SUFFIXES))
-        raise ValueError(f"no images in {folder} (looked for {suffixes}, there and in images/)")
-    if taken != folder and found[folder]:
-        log.warning("images are taken from %s; %d next to it are ignored", taken, len(found[folder]))
-    return sorted(found[taken], key=lambda file: by_number(file.name))
+    if not faults:
+        return
+    if count == 1:
+        raise DataError(" ".join(("the only image", *next(iter(faults.items())))))
+    named = [f"{name} {fault}" for name, fault in faults.items()]
+    said = "; ".join(named[:10]) + (f"; and {len(named) - 10} more" if len(named) > 10 else "")
+    if len(faults) == count:
+        raise DataError(f"none of the {count} images can be used: {said}")
+    log.warning("%d of %d images are left out: %s", len(faults), count, said)
 
 
-def image_folders(folder: Path) -> list[Path]:
-    """Lists the image subfolders of a folder, ignoring case; reduced ones (``images_4``) come last."""
-    found = [path for path in folder.iterdir() if path.is_dir() and is_image_folder(path.name)]
-    order = {name: number for number, name in enumerate(IMAGE_FOLDERS)}
-    return sorted(found, key=lambda path: (order.get(path.name.lower(), len(order)), by_number(path.name)))
+def _allow_heic(path: Path) -> None:
+    """Makes Pillow read HEIC if the file is one."""
+    if path.suffix.lower() not in HEIC_SUFFIXES:
+        return
+    if importlib.util.find_spec("pillow_heif") is None:
+        raise ValueError(f"{path} is HEIC and requires pillow-heif: pip install pillow-heif, or save it as JPEG")
+    from pillow_heif import register_heif_opener  # pyright: ignore[reportMissingImports]
 
-
-def _is_image(path: Path) -> bool:
-    return path.suffix.lower() in (*IMAGE_SUFFIXES, *HEIC_SUFFIXES) and not path.name.startswith(".")
+    register_heif_opener()
 
 
 def _photo(path: Path, content_of: Callable[[Path], bytes | None] = lambda _: None) -> Picture:
     """Returns a photograph; ``content_of`` reads files inside an archive."""
-    if path.suffix.lower() in HEIC_SUFFIXES:
-        if importlib.util.find_spec("pillow_heif") is None:
-            raise ValueError(f"{path} is HEIC and requires pillow-heif: pip install pillow-heif, or save it as JPEG")
-        from pillow_heif import register_heif_opener  # pyright: ignore[reportMissingImports]
-
-        register_heif_opener()
+    _allow_heic(path)
 
     def read(size: tuple[int, int]) -> Frames:
         content = content_of(path)
-        pixels = read_color(path, "", content=content, upright=True)
+        pixels = read_color(path, "", content=content, upright=True, least=size)
         return frame_of(shrunk(pixels, size), mask_for(path, content=content))
 
     content = content_of(path)
@@ -324,7 +349,7 @@ def without_copies(pictures: Sequence[Picture]) -> list[Picture]:
     first: dict[str, str] = {}
     found, copies = [], []
     for picture in pictures:
-        key = digest(picture) if picture.path is not None and _is_image(picture.path) else None
+        key = digest(picture) if picture.path is not None and is_photo(picture.path) else None
         if key in first:
             copies.append(f"{picture.name} (as {first[key]})")
             continue

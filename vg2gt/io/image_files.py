@@ -32,6 +32,8 @@ _ORIENTATION_TAG = 0x0112
 _UPRIGHT = ("FLIP_LEFT_RIGHT", "ROTATE_180", "FLIP_TOP_BOTTOM", "TRANSPOSE", "ROTATE_270", "TRANSVERSE", "ROTATE_90")
 _TURNS = {number: Image.Transpose[name] for number, name in enumerate(_UPRIGHT, 2)}  # by EXIF orientation
 _QUARTER_TURNS = (5, 6, 7, 8)
+_LARGE = 24_000_000  # pixels; larger images are decoded at reduced size where that suffices
+_DRAFT = 8  # largest reduction by the decoder
 _SAME_SHAPE = 0.02  # relative difference of aspect ratios of the same shape
 _FILM_DIAGONAL = math.hypot(36, 24)  # millimetres
 
@@ -47,6 +49,15 @@ def image_size(path: Path, scene: str, upright: bool = False, content: bytes | N
     """
     with _opened(path, scene, content) as image:
         return _size(image, upright)
+
+
+def is_damaged(path: Path) -> bool:
+    """Whether a file cannot be opened as an image; nothing is decoded."""
+    try:
+        image_size(path, "")
+    except DataError:
+        return True
+    return False
 
 
 def focal_length(path: Path, size: Size) -> float | None:
@@ -83,7 +94,12 @@ def typical_size(sizes: Iterable[Size]) -> Size:
 
 
 def read_color(
-    path: Path, scene: str, size: Size | None = None, content: bytes | None = None, upright: bool = False
+    path: Path,
+    scene: str,
+    size: Size | None = None,
+    content: bytes | None = None,
+    upright: bool = False,
+    least: Size | None = None,
 ) -> NDArray[np.uint8]:
     """Reads a colour image ``[H, W, 3]``.
 
@@ -93,10 +109,43 @@ def read_color(
         size: required ``(height, width)``; None: any.
         content: the encoded image if it is a part of the file; None: the whole file.
         upright: turn a photograph upright by its EXIF orientation.
+        least: ``(height, width)`` that suffices. Large images are decoded at a half, quarter or eighth of their size if
+            that is at least twice as large; the whole of the image is kept, to fractions of a pixel. None: full size.
     """
     with _opened(path, scene, content) as image:
-        check_size(path, scene, _size(image, upright), size)  # before anything is decoded
-        return np.array(_turned(color_image(image), _orientation(image) if upright else 1))
+        found = _size(image, upright)
+        check_size(path, scene, found, size)  # before anything is decoded
+        turn = _orientation(image) if upright else 1
+        factor = 1 if least is None else _reduction(found, least)
+        return np.array(_turned(color_image(image if factor == 1 else _reduced(image, factor)), turn))
+
+
+def _reduction(size: Size, least: Size) -> int:
+    """Returns the factor by which an image of ``(height, width)`` is reduced while it is decoded: 1, 2, 4 or 8."""
+    factor = min(size[0] // least[0], size[1] // least[1]) // 2
+    if factor < _DRAFT and size[0] * size[1] <= _LARGE:
+        return 1
+    return max(step for step in (1, 2, 4, _DRAFT) if step <= max(factor, 1))
+
+
+def _reduced(image: Image.Image, factor: int) -> Image.Image:
+    """Returns an image reduced by a factor, by the decoder if it is a JPEG; unchanged if its mode allows neither."""
+    width, height = image.size
+    target = (round(width / factor), round(height / factor))
+    if image.format in ("JPEG", "MPO"):
+        image.draft(image.mode, (width // factor, height // factor))
+        if image.size == (width, height):
+            return image
+        small = image
+    elif image.mode in ("RGB", "RGBA", "L", "LA", "CMYK"):
+        small = image.reduce(factor)
+    else:
+        return image
+    if small.size != target or width % factor or height % factor:  # the last block of a row or column is incomplete
+        small = small.resize(target, Image.Resampling.BILINEAR, (0, 0, width / factor, height / factor))
+    # what the conversion of colours looks at
+    small.info, small.format, small.filename = image.info, image.format, getattr(image, "filename", "")  # pyright: ignore
+    return small
 
 
 def read_mask(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import threading
 from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any
@@ -35,16 +36,33 @@ BACKGROUND = (255, 255, 255, 255)  # behind transparent pixels
 _FORMATS = ("PNG", "JPEG", "MPO", "PPM", "TIFF", "WEBP", "BMP", "GIF", "HEIF", "AVIF")
 
 
+MOST_PIXELS = 300_000_000  # of an image; Pillow's own limit is 179 million
+_opening = threading.Lock()
+
+
 def open_image(file: str | Path | IO[bytes]) -> Image.Image:
     """Opens an image file lazily with Pillow, restricted to formats of photographs and depth images.
 
     Raises:
-        OSError: if the file is missing, not a regular file, or of another format.
+        OSError: if the file is missing, empty, not a regular file, of another format, or of more than 300 megapixels.
     """
     if isinstance(file, (str, Path)):
         regular(file)
+        if not Path(file).stat().st_size:
+            raise OSError("the file is empty")
     Image.init()
-    return Image.open(file, formats=[name for name in _FORMATS if name in Image.OPEN])
+    with _opening:  # Pillow's limit is global
+        limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+        try:
+            image = Image.open(file, formats=[name for name in _FORMATS if name in Image.OPEN])
+        finally:
+            Image.MAX_IMAGE_PIXELS = limit
+    if image.width * image.height > MOST_PIXELS:
+        image.close()
+        raise OSError(
+            f"it has {image.width}x{image.height} pixels, more than {MOST_PIXELS // 10**6} million: reduce it"
+        )
+    return image
 
 
 def has_alpha(image: Image.Image) -> bool:

@@ -15,6 +15,7 @@ from vg2gt.data.sources.undistortion import undistortion_of
 from vg2gt.data.transforms import resize_to_cover
 from vg2gt.data.views import SceneSample
 from vg2gt.evaluation.checks import refuse_without_hints
+from vg2gt.geometry.cameras import resize_intrinsics
 from vg2gt.io import colmap_from_views, colmap_images, read_colmap, write_colmap
 from vg2gt.runs.load import load_model
 
@@ -72,6 +73,29 @@ def test_distorted_images_are_undistorted_when_read(tmp_path):
     assert np.array_equal(pixels(loaded)[0], expected)
     assert np.abs(expected.mean() - pixels(frames)[1].mean()) < 10
     assert (loaded.depth > 0).sum() > 0.7 * POINTS_A_VIEW
+
+
+@pytest.mark.parametrize("distorted", [False, True])
+def test_large_images_are_reduced_with_their_cameras(tmp_path, distorted: bool, monkeypatch) -> None:
+    frames = room(3)
+    write(tmp_path, frames)
+    model = read_colmap(tmp_path / "statue" / "sparse" / "0")
+    for camera in model.cameras.values() if distorted else ():
+        fx, _, cx, cy = camera.params
+        camera.model, camera.params = "SIMPLE_RADIAL", [fx, cx, cy, 0.02]
+    write_colmap(tmp_path / "statue" / "sparse" / "0", model)
+    source = COLMAP(str(tmp_path))
+    whole = source.load_whole("statue", 1)
+    monkeypatch.setattr("vg2gt.io.image_files._LARGE", 100)
+    small = source.load_whole("statue", 1, (7, 10))
+    height, width = whole.images.shape[-2:]
+    assert small.images.shape[-2:] == (round(height / 2), round(width / 2))
+    expected = torch.nn.functional.interpolate(whole.images, small.images.shape[-2:], mode="area")
+    error = (small.images - expected).abs().mean()
+    assert error < 0.03  # undistorting samples other pixels
+    assert all(error < 0.5 * (small.images.roll(1, side) - expected).abs().mean() for side in (-2, -1))
+    matrix = resize_intrinsics(whole.intrinsics, small.images.shape[-1] / width, small.images.shape[-2] / height)
+    assert torch.allclose(small.intrinsics, matrix, atol=1e-3)
 
 
 def test_the_larger_model_is_taken_and_the_other_named(tmp_path, caplog):

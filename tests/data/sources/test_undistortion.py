@@ -86,3 +86,22 @@ def test_depth_takes_one_pixel_and_holes_stay():
 def test_senseless_coefficients_are_refused(coefficients):
     with pytest.raises(ValueError, match="maps the image border outside the image"):
         Undistortion.of(lens_of([110.0, 65.0, 45.0, *coefficients], "RADIAL"))
+
+
+def test_reduced_images_are_undistorted_to_the_same_camera():
+    """Each pixel of a quarter is looked up where the sixteen of the whole are, also if the sides are no multiples."""
+    lens = lens_of(MODELS["OPENCV"], "OPENCV")
+    lens.rescale(1001, 702)
+    whole = Undistortion.of(lens)
+    small = whole.reduced((175, 250))
+    for side in (0, 1):
+        scale = small.size[side] / whole.size[side]
+        axis = 1 - side
+        assert abs(scale * 4 - 1) < 0.01
+        assert small.intrinsics[axis, axis] == pytest.approx(whole.intrinsics[axis, axis] * scale)
+    directions, places = _directions(small.intrinsics, small.size), (small.places + 0.5) / [250, 175]
+    x, y = (directions[..., axis] * whole.intrinsics[axis, axis] + whole.intrinsics[axis, 2] for axis in (0, 1))
+    rows, columns = y.round().astype(int)[5:-5, 5:-5], x.round().astype(int)[5:-5, 5:-5]
+    expected = (whole.places[rows, columns] + 0.5) / [1001, 702]
+    np.testing.assert_allclose(places[5:-5, 5:-5], expected, atol=1.5e-3)  # 0.7 of 1001 pixels, from rounding
+    assert whole.reduced((702, 1001)) is whole

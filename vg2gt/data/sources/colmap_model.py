@@ -86,7 +86,7 @@ class COLMAP(FileSource):
         with errors_name(scene):
             records = colmap_images(read_colmap(model_folder))
             named = {i: named_file(folder / self.images, record.name, where) for i, record in enumerate(records)}
-            color = {i: found for i, path in named.items() if (found := existing_image(path)) is not None}
+            color = self.sound({i: found for i, path in named.items() if (found := existing_image(path)) is not None})
         if not color:
             names = f"the first is {records[0].name}, expected at {named[0]}" if records else "it names none"
             raise DataError(

@@ -21,8 +21,9 @@ from vg2gt.data.sources.masks import joined_masks, resized_mask
 from vg2gt.data.sources.parsing import expanded
 from vg2gt.data.sources.undistortion import undistortion_of
 from vg2gt.data.transforms import from_bytes, resize_depth, resize_images, resize_to_cover
+from vg2gt.geometry.cameras import resize_intrinsics
 from vg2gt.io.files import write_cached
-from vg2gt.io.image_files import Size, check_size, read_color, read_depth, read_mask, read_mask_file
+from vg2gt.io.image_files import Size, check_size, is_damaged, read_color, read_depth, read_mask, read_mask_file
 
 log = logging.getLogger(__name__)
 
@@ -81,6 +82,8 @@ class FileSource(SceneSource):
     """Whether depth is known at single pixels only; see :class:`~vg2gt.data.base.Frames`."""
     reads_masks: ClassVar[bool] = False
     """Whether alpha and mask files weight the pixels; if not, alpha is only composited over white."""
+    leave_out_damaged: bool = False
+    """Whether images that cannot be opened are left out, with a warning; otherwise they are errors."""
     depth_scale: float = 1000.0
     """Stored depth units per unit of the poses."""
     invalid: tuple[int, ...] = ()
@@ -128,13 +131,28 @@ class FileSource(SceneSource):
     def index(self, scene: str, folder: Path) -> SceneIndex:
         """Reads the file lists, poses and intrinsics of a scene."""
 
-    def read_color(self, index: SceneIndex, row: int) -> NDArray[np.uint8]:
-        """Decodes the colour image ``[h, w, 3]`` of a row of the index, undistorted."""
+    def sound(self, color: Mapping[int, Path]) -> dict[int, Path]:
+        """Returns the images, by frame number, without those that cannot be opened if these may be left out."""
+        damaged = [i for i, path in color.items() if is_damaged(path)] if self.leave_out_damaged else []
+        if damaged:
+            names = _some([str(color[i]) for i in damaged])
+            log.warning("%d of %d images cannot be read and are left out: %s", len(damaged), len(color), names)
+        return {i: path for i, path in color.items() if i not in damaged} if len(damaged) < len(color) else dict(color)
+
+    def read_color(self, index: SceneIndex, row: int, least: Size | None = None) -> NDArray[np.uint8]:
+        """Decodes the colour image ``[h, w, 3]`` of a row of the index, undistorted.
+
+        Args:
+            index: the scene.
+            row: row of the frame in the index.
+            least: ``(height, width)`` that suffices (``image_files.read_color``); None: full size.
+        """
         lens, upright = index.lens(row), index.of_image("upright", row, False)
         if not lens:
-            return read_color(index.color[row], index.name, index.color_size, upright=upright)
+            return read_color(index.color[row], index.name, index.color_size, upright=upright, least=least)
         undistortion = undistortion_of(lens)
-        return undistortion.color(read_color(index.color[row], index.name, undistortion.lens_size, upright=upright))
+        pixels = read_color(index.color[row], index.name, undistortion.lens_size, upright=upright, least=least)
+        return undistortion.reduced((pixels.shape[0], pixels.shape[1])).color(pixels)
 
     def read_mask(self, index: SceneIndex, row: int) -> NDArray[np.float32] | None:
         """Reads the pixel weights ``[h, w]`` in [0, 1] of a colour image from its mask file and alpha; None: all 1."""
@@ -193,10 +211,17 @@ class FileSource(SceneSource):
         index = self.scene_index(scene)
         return Frames.concatenate([self._load_frame(index, index.row(frame)) for frame in frame_ids])
 
-    def load_whole(self, scene: str, frame: int) -> Frames:
-        """Decodes one frame at its own size (``SceneIndex.own_size``), without cropping."""
+    def load_whole(self, scene: str, frame: int, least: Size | None = None) -> Frames:
+        """Decodes one frame without cropping.
+
+        Args:
+            scene: its scene.
+            frame: its number.
+            least: ``(height, width)`` that suffices; large images without depth may be reduced to that. None: the
+                frame's own size (``SceneIndex.own_size``).
+        """
         index = self.scene_index(scene)
-        return self._load_frame(index, index.row(frame), whole=True)
+        return self._load_frame(index, index.row(frame), True, None if index.depth else least)
 
     def scene_index(self, scene: str) -> SceneIndex:
         """Returns the index of a scene, from memory, the cache, or the dataset."""
@@ -209,19 +234,23 @@ class FileSource(SceneSource):
             self._indices[scene] = self._recall_index(scene, self._folders[scene])
         return self._indices[scene]
 
-    def _load_frame(self, index: SceneIndex, row: int, whole: bool = False) -> Frames:
-        pixels = self.read_color(index, row)
-        if index.color_size is None:
+    def _load_frame(self, index: SceneIndex, row: int, whole: bool = False, least: Size | None = None) -> Frames:
+        pixels = self.read_color(index, row) if least is None else self.read_color(index, row, least)
+        if index.color_size is None and least is None:
             check_size(index.color[row], index.name, pixels.shape[:2], index.own_size(row))
         images = from_bytes(torch.from_numpy(pixels)).permute(2, 0, 1)[None].contiguous()  # [1, 3, H, W]
         depth = torch.zeros_like(images[:, 0])  # [1, H, W]
         if index.depth:
             depth = torch.from_numpy(self._valid_depth(index, row, index.depth_size or pixels.shape[:2]))[None]
         poses = torch.from_numpy(index.world_to_camera[row : row + 1]).float()
-        intrinsics = torch.from_numpy(index.intrinsics[row : row + 1]).float()
+        intrinsics = torch.from_numpy(index.intrinsics[row : row + 1])
+        if least is not None:
+            own = index.own_size(row)
+            intrinsics = resize_intrinsics(intrinsics, pixels.shape[1] / own[1], pixels.shape[0] / own[0])
+        intrinsics = intrinsics.float()
         stored = self.read_mask(index, row)
         mask = None if stored is None else torch.from_numpy(resized_mask(stored, pixels.shape[:2]))[None]
-        if index.color_size is None:
+        if index.color_size is None or least is not None:
             frames = Frames(images, depth, poses, intrinsics, self.sparse_depth, mask)
             return frames if whole else resize_to_cover(frames, index.size)
         depth = resize_depth(depth, index.size, self.sparse_depth)

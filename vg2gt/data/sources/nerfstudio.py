@@ -80,7 +80,7 @@ class Nerfstudio(FileSource):
         where = f"{transforms_files(folder)[0]} of scene {scene}"
         with errors_name(scene):
             named = _named_files(folder, records, "file_path", where)
-            color = {i: found for i, path in named.items() if (found := existing_image(path)) is not None}
+            color = self.sound({i: found for i, path in named.items() if (found := existing_image(path)) is not None})
             depth = _named_files(folder, records, "depth_file_path", where) if self.has_depth else {}
             depth = {i: path for i, path in depth.items() if path.is_file()}
             masks = _named_files(folder, records, "mask_path", where)

@@ -133,8 +133,8 @@ class RGBDFolder(FileSource):
             scene, folder, found.color, depth, found.poses, matrices, found.color_size, size=size, depth_size=size
         )
 
-    def read_color(self, index: SceneIndex, row: int) -> NDArray[np.uint8]:
-        """Decodes a colour image, or a frame of a video."""
+    def read_color(self, index: SceneIndex, row: int, least: Size | None = None) -> NDArray[np.uint8]:
+        """Decodes a colour image, or a frame of a video, at full size."""
         path = index.color[row]
         with errors_name(index.name):
             if path.name != VIDEO:
@@ -176,7 +176,7 @@ class RGBDFolder(FileSource):
             poses = numbered(folder, scene, "frame-*.pose.txt", suffixes=(".txt",))
             cameras = [*_beside(folder), *_beside(folder.parent)]  # in the folder of the frames or of the sequences
         check_found(scene, folder, {"colour images": color, "depth images": depth if self.has_depth else color})
-        color_size = first_size(color, scene)
+        color_size = first_size(self.sound(color), scene)
         depth_size = first_size(depth, scene) if self.has_depth else color_size
         if poses is None:
             raise DataError(

@@ -7,7 +7,7 @@ are undistorted with the same map as colours. A file or camera that does not mat
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -47,13 +47,19 @@ class Undistortion:
         lens_size: ``(height, width)`` of the distorted images.
         size: ``(height, width)`` of the undistorted images.
         intrinsics: ``[3, 3]`` of the undistorted images, integer pixel centres.
-        places: ``[h, w, 2]`` float32 position (x, y) in the distorted image of each undistorted pixel.
+        camera: the distorted camera.
     """
 
     lens_size: Size
     size: Size
     intrinsics: NDArray[np.float64]
-    places: NDArray[np.float32]
+    camera: Camera
+
+    @cached_property
+    def places(self) -> NDArray[np.float32]:
+        """Position (x, y) in the distorted image of each undistorted pixel, ``[h, w, 2]`` float32."""
+        fine = interpolate(_coarse_places(self), self.size, mode="bilinear", align_corners=True)
+        return fine[0].permute(1, 2, 0).float().contiguous().numpy()
 
     @staticmethod
     def of(camera: Camera) -> Undistortion:
@@ -62,11 +68,11 @@ class Undistortion:
         Raises:
             ValueError: if the camera model has no focal length (EQUIRECTANGULAR), or if its distortion is implausible.
         """
-        intrinsics = colmap_intrinsics(camera)  # raises if there is no focal length
+        colmap_intrinsics(camera)  # raises if there is no focal length
         target = pinhole_camera(camera)
         size, lens_size = (target.height, target.width), (camera.height, camera.width)
-        intrinsics = colmap_intrinsics(target)
-        places = _places(camera, intrinsics, size)
+        found = Undistortion(lens_size, size, colmap_intrinsics(target), camera)
+        places = _coarse_places(found)[0].permute(1, 2, 0).numpy()  # the others are between them
         inside = (places >= -0.5 - _OUTSIDE) & (places <= np.array(lens_size[::-1]) - 0.5 + _OUTSIDE)
         too_small = min(size[0] / lens_size[0], size[1] / lens_size[1]) < _SMALLEST
         if too_small or not inside.all():  # also if one is NaN
@@ -74,7 +80,17 @@ class Undistortion:
                 f"the distortion of a {camera.model_name} camera ({camera.params_info}: {camera.params_to_string()}) "
                 "maps the image border outside the image; it does not belong to these images"
             )
-        return Undistortion(lens_size, size, intrinsics, places)
+        return found
+
+    def reduced(self, lens_size: Size) -> Undistortion:
+        """Returns the undistortion of reduced images of ``(height, width)`` to the same, reduced pinhole camera."""
+        if lens_size == self.lens_size:
+            return self
+        scale = [mine / whole for mine, whole in zip(lens_size, self.lens_size, strict=True)]
+        size = (round(self.size[0] * scale[0]), round(self.size[1] * scale[1]))
+        matrix = torch.from_numpy(self.intrinsics)
+        matrix = resize_intrinsics(matrix, size[1] / self.size[1], size[0] / self.size[0]).numpy()
+        return Undistortion(lens_size, size, matrix, resized_camera(self.camera, lens_size))
 
     def color(self, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Undistorts an image ``[h, w, C]`` by bilinear lookup."""
@@ -105,23 +121,29 @@ def undistortion_of(lens: str) -> Undistortion:
     return Undistortion.of(camera)
 
 
-def lens_text(camera: Camera, size: Size) -> str:
-    """Serialises a camera, resized to images of ``(height, width)``, as ``MODEL WIDTH HEIGHT PARAMETERS``."""
+def resized_camera(camera: Camera, size: Size) -> Camera:
+    """Returns a camera for images resized to ``(height, width)``."""
     resized = type(camera)(camera.todict())
     resized.rescale(size[1], size[0])
+    return resized
+
+
+def lens_text(camera: Camera, size: Size) -> str:
+    """Serialises a camera, resized to images of ``(height, width)``, as ``MODEL WIDTH HEIGHT PARAMETERS``."""
+    resized = resized_camera(camera, size)
     params = " ".join(repr(float(value)) for value in resized.params)
     return f"{resized.model_name} {size[1]} {size[0]} {params}"
 
 
-def _places(camera: Camera, intrinsics: NDArray[np.float64], size: Size) -> NDArray[np.float32]:
+def _coarse_places(undistortion: Undistortion) -> torch.Tensor:
+    """Returns the places of a grid of undistorted pixels from corner to corner, ``[1, 2, rows, columns]`` float64."""
+    camera, intrinsics, size = undistortion.camera, undistortion.intrinsics, undistortion.size
     rows, columns = (min(side, max(-(-side // _STEP), _FEWEST)) for side in size)
     y, x = np.meshgrid(np.linspace(0, size[0] - 1, rows), np.linspace(0, size[1] - 1, columns), indexing="ij")
     rays = np.stack((x, y, np.ones_like(x)), -1).reshape(-1, 3) @ np.linalg.inv(intrinsics).T
     with np.errstate(all="ignore"):
         coarse = camera.img_from_cam(np.ascontiguousarray(rays)) - PIXEL_CENTER
-    coarse = torch.from_numpy(coarse.reshape(1, rows, columns, 2)).permute(0, 3, 1, 2)
-    fine = interpolate(coarse, size, mode="bilinear", align_corners=True)
-    return fine[0].permute(1, 2, 0).float().contiguous().numpy()
+    return torch.from_numpy(coarse.reshape(1, rows, columns, 2)).permute(0, 3, 1, 2)
 
 
 def size_on_disk(path: Path, scene: str, expected: Size, where: str, as_stored: bool = True) -> tuple[Size, bool]:

@@ -1,0 +1,141 @@
+"""Images that show nothing are left out by name, black borders are masked."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image, ImageFilter
+
+from tests.inputs.test_given_cameras import NAMES, put_cameras, put_colmap, put_poses
+from vg2gt.data.base import DataError
+from vg2gt.inputs.cameras import pictures_for
+from vg2gt.inputs.pictures import find_pictures
+from vg2gt.inputs.usable import usable_pictures
+from vg2gt.monitor import Monitor
+
+SHAPE = (96, 144)
+
+
+def scenery(seed: int, shape: tuple[int, int] = SHAPE) -> np.ndarray:
+    """Grey noise with structures of all sizes, uint8 ``[h, w, 3]``, no pixel darker than 40."""
+    rng, found = np.random.default_rng(seed), np.zeros((*shape, 1))
+    for step in (1, 2, 4, 8, 16, 32):
+        noise = rng.normal(size=(-(-shape[0] // step), -(-shape[1] // step), 1)).astype(np.float32)
+        found += step**0.5 * noise.repeat(step, 0).repeat(step, 1)[: shape[0], : shape[1]]
+    return (130 + 90 * np.tanh(found / found.std() / 2)).astype(np.uint8).repeat(3, 2)
+
+
+def spoil(path: Path, how: str) -> None:
+    """Damages an image in one of the ways that people have."""
+    with Image.open(path) as image:
+        size, whole = image.size, image.convert("RGB")
+    if how in ("empty", "cut"):
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2 if how == "cut" else 0])
+        return
+    rng = np.random.default_rng(0)
+    noise = rng.integers(0, 9, (size[1], size[0], 3))  # of the sensor
+    dark, bright = noise.astype(np.uint8), (255 - noise // 3).astype(np.uint8)
+    bright[:5, :20] = 100  # a rest that is not clipped
+    moved = np.mean([np.roll(np.asarray(whole, np.float32), k, 1) for k in range(size[0] // 10)], 0)
+    spoilt = {
+        "black": dark,
+        "white": bright,
+        "blur": np.asarray(whole.filter(ImageFilter.GaussianBlur(size[0] / 40))),
+        "shake": moved.astype(np.uint8),
+        "grey": np.full_like(dark, 128),
+    }
+    Image.fromarray(spoilt[how]).save(path)
+
+
+SAID = {
+    "empty": "cannot be read (the file is empty)",
+    "cut": "cannot be read (image file is truncated",
+    "black": "is black",
+    "white": "is over-exposed",
+    "blur": "is blurred",
+    "shake": "is blurred",
+    "grey": "is of one colour",
+}
+
+
+def test_what_shows_nothing_is_left_out_by_name(tmp_path: Path, caplog) -> None:
+    kinds = [*SAID, *(f"good{number}" for number in range(9))]
+    for number, kind in enumerate(kinds):
+        Image.fromarray(scenery(number, (288, 432))).save(tmp_path / f"{kind}.jpg", quality=92)
+        if kind in SAID:
+            spoil(tmp_path / f"{kind}.jpg", kind)
+    (tmp_path / "text.jpg").write_text("no image")
+    found = usable_pictures(find_pictures(tmp_path), Monitor())
+    assert [picture.name for picture in found] == [kind for kind in kinds if kind.startswith("good")]
+    for kind, said in SAID.items():
+        assert f"{kind} {said}" in caplog.text.replace(f"{tmp_path}/", "").replace(".jpg", "")
+    assert "text.jpg cannot be read" in caplog.text
+
+
+def test_dark_and_bright_scenes_and_bare_walls_are_kept(tmp_path: Path, caplog) -> None:
+    """Night, a white table, an object on black, a wall among textured views."""
+    wall = 180 + np.linspace(0, 20, SHAPE[1])[None, :, None] + np.random.default_rng(0).normal(size=(*SHAPE, 3))
+    for number in range(5):
+        night, table = (scenery(number) // 6), np.full((*SHAPE, 3), 255, np.uint8)
+        table[30:50, 40 + number : 70 + number] = scenery(number)[:20, :30]
+        for name, pixels in (("night", night), ("table", table), ("object", 255 - table), ("room", scenery(number))):
+            (tmp_path / name).mkdir(exist_ok=True)
+            Image.fromarray(pixels).save(tmp_path / name / f"{number}.png")
+    Image.fromarray(wall.astype(np.uint8)).save(tmp_path / "room" / "wall.png")
+    for folder in tmp_path.iterdir():
+        pictures = find_pictures(folder)
+        kept = usable_pictures(pictures, Monitor())
+        assert len(kept) == len(pictures), folder
+        assert all(picture.read(SHAPE).mask is None for picture in kept), folder
+    assert not caplog.text
+
+
+def test_nothing_left_is_an_error(tmp_path: Path) -> None:
+    for name in ("a.png", "b.png"):
+        Image.fromarray(np.zeros((*SHAPE, 3), np.uint8)).save(tmp_path / name)
+    with pytest.raises(DataError, match="none of the 2 images can be used: a is black; b is black"):
+        usable_pictures(find_pictures(tmp_path), Monitor())
+    with pytest.raises(DataError, match="the only image b is black"):
+        usable_pictures(find_pictures(tmp_path / "b.png"), Monitor())
+    for name in ("a.png", "b.png"):
+        (tmp_path / name).write_bytes(b"")
+    with pytest.raises(DataError, match=r"none of the 2 images can be used: \S*a\.png cannot be read \(the file is em"):
+        find_pictures(tmp_path)
+
+
+@pytest.mark.parametrize("layout", ["cameras.json", "COLMAP", "poses"])
+@pytest.mark.parametrize("how", ["empty", "cut", "black"])
+def test_failed_frames_with_given_cameras(layout, how: str, folder: Path, recording, frames, model, caplog) -> None:
+    """A frame of a lens cap cost the others 1.5 dB, a damaged one ended everything."""
+    if layout == "poses":
+        put_poses(folder, recording)
+    else:
+        (put_colmap if layout == "COLMAP" else put_cameras)(folder, frames)
+    spoil(folder / "images" / NAMES[0], how)
+    with pictures_for(model, folder) as pictures:
+        assert [picture.name for picture in pictures] == [name[:-4] for name in NAMES[1:]]
+        assert torch.allclose(pictures[0].read((84, 112)).world_to_camera[0], frames.world_to_camera[1], atol=1e-5)
+    assert NAMES[0][:-4] in caplog.text
+    assert "left out" in caplog.text
+
+
+@pytest.mark.parametrize("suffix", ["png", "jpg"])
+def test_black_borders_are_masked(tmp_path: Path, suffix: str, caplog) -> None:
+    """Of undistorted photographs: black outside of a barrel."""
+    shape = (640, 960)
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    right, down = x / (shape[1] - 1) * 2 - 1, y / (shape[0] - 1) * 2 - 1
+    outside = (np.hypot(right, 0.7 * down) > 1.1) | (down < 0.04 * right**2 - 0.97)
+    for number in range(3):
+        pixels = np.where(outside[..., None], 0, scenery(number, shape)).astype(np.uint8)
+        pixels[200:400, 400 + 20 * number : 550] = 0  # something black that is no border
+        Image.fromarray(pixels).save(tmp_path / f"{number}.{suffix}", quality=95)
+    found = usable_pictures(find_pictures(tmp_path), Monitor())
+    assert "3 images have black borders" in caplog.text
+    for size in (shape, (96, 144)):
+        mask = found[1].read(size).mask[0]
+        expected = torch.from_numpy(~outside).float()[None, None]
+        inside = torch.nn.functional.interpolate(expected, mask.shape, mode="area")[0, 0]
+        assert mask[inside == 0].max() == 0
+        assert mask[inside == 1].mean() > 0.97

@@ -1,0 +1,175 @@
+"""Leaves out pictures that show nothing (damaged, black, over-exposed, blurred) and masks the black borders of others.
+
+Undistorted photographs have borders that are black in all images of a size and end abruptly. A dark background does
+neither: its edge differs from image to image.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+from scipy import ndimage
+
+from vg2gt.data.base import DataError, Frames
+from vg2gt.data.sources.masks import joined_masks, resized_mask
+from vg2gt.data.transforms import to_bytes
+from vg2gt.inputs.pictures import IN_MEMORY, Picture, name_left_out, reason_of
+from vg2gt.monitor import Monitor
+
+log = logging.getLogger(__name__)
+
+_SIDE = 320  # longer side of the images that are looked at
+_BLACK, _WHITE = 12, 250  # values of 255 up to and from which a pixel shows nothing
+_ALL, _NEARLY_ALL, _USUAL = 0.995, 0.9, 0.5  # shares of such pixels: always, or where most images have fewer than usual
+_FLAT = 1.0  # standard deviation of the brightness of an image that shows nothing
+_COARSE = (4, 16)  # pixels of structures that blur leaves
+_BLURRED = 0.03  # least detail of 1 pixel in the worst direction, relative to the coarse one and to the images' median
+_FEWEST = 3  # images that are compared with each other
+_BORDER, _LIT = 6, 24  # values of 255 of a border at most, and of the image next to it at least
+_BORDERS = (0.001, 0.6)  # least and largest share of the pixels
+_MARGIN = 2  # masked pixels along a border, where it is blurred by compression
+_EDGE = 2  # further pixels, where the image is lit
+_OFTEN = 0.7  # share of the images, and of the pixels along the border, in which they are
+
+
+@dataclass(frozen=True)
+class _Look:
+    """What a small copy of a picture shows: shares of black and white pixels, spread and detail of the brightness."""
+
+    black: float
+    white: float
+    spread: float
+    detail: float
+
+
+class _Borders:
+    """The brightest value and the number of lit values of each pixel of the images of one size."""
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self.peak, self.lit, self.count = np.zeros(shape, np.uint8), np.zeros(shape, np.int32), 0
+
+    def add(self, brightest: NDArray[np.uint8]) -> None:
+        """Takes an image ``[h, w]`` of the brightest channels."""
+        self.peak = np.maximum(self.peak, brightest)
+        self.lit += brightest > _LIT
+        self.count += 1
+
+    def mask(self) -> NDArray[np.float32] | None:
+        """Returns a mask ``[h, w]``, 0 on black borders; None if there are none."""
+        labels: NDArray[np.int32] = np.zeros(self.peak.shape, np.int32)
+        ndimage.label(self.peak <= _BORDER, output=labels)
+        edge = np.concatenate((labels[0], labels[-1], labels[:, 0], labels[:, -1]))
+        black = np.isin(labels, np.unique(edge[edge > 0]))
+        if self.count < _FEWEST or not _BORDERS[0] <= black.mean() <= _BORDERS[1]:
+            return None
+        near = np.asarray(ndimage.binary_dilation(black, np.ones((3, 3)), iterations=_MARGIN))
+        ring = np.asarray(ndimage.binary_dilation(near, np.ones((3, 3)), iterations=_EDGE)) & ~near
+        often = self.lit[ring] >= _OFTEN * self.count
+        return (~near).astype(np.float32) if len(often) and often.mean() >= _OFTEN else None
+
+
+def usable_pictures(pictures: Sequence[Picture], monitor: Monitor) -> list[Picture]:
+    """Returns the pictures that can be read and show something; those left out are named in a warning.
+
+    Black borders, which undistorted photographs have, are masked.
+
+    Args:
+        pictures: the pictures; each is decoded once, at a small size. Long videos are not looked at.
+        monitor: shows the progress.
+
+    Raises:
+        ValueError: if none is left.
+    """
+    if sum(picture.container is not None for picture in pictures) > IN_MEMORY:
+        return list(pictures)
+    looks: dict[str, _Look] = {}
+    faults: dict[str, str] = {}
+    borders: dict[tuple[int, int], _Borders] = {}
+    with monitor.stage("check images", len(pictures)) as advance:
+        for picture in pictures:
+            try:
+                pixels = _small(picture)
+            except DataError as error:
+                faults[picture.name] = reason_of(error)
+            else:
+                looks[picture.name] = _look(pixels)
+                if not picture.lens and not picture.has_depth:
+                    own = borders.setdefault(picture.size, _Borders(pixels.shape[:2]))
+                    own.add(pixels.max(2))
+            advance()
+    faults |= _faults(looks)
+    name_left_out(faults, len(pictures))
+    masks = {size: mask for size, own in borders.items() if (mask := own.mask()) is not None}
+    found = [each for each in pictures if each.name not in faults]
+    bordered = [each for each in found if not each.lens and not each.has_depth and each.size in masks]
+    if bordered:
+        share = np.mean([1 - masks[each.size].mean() for each in bordered])
+        log.warning(
+            "%d images have black borders, %.1f %% of their pixels, which are masked", len(bordered), share * 100
+        )
+    names = {each.name for each in bordered}
+    return [_masked(each, masks[each.size]) if each.name in names else each for each in found]
+
+
+def _small(picture: Picture) -> NDArray[np.uint8]:
+    """Reads a picture ``[h, w, 3]`` with a longer side of at most 320 pixels, its depth too if it has any."""
+    scale = min(1.0, _SIDE / max(picture.size))
+    height, width = (max(1, round(side * scale)) for side in picture.size)
+    pixels = to_bytes(picture.read((height, width)).images[0]).permute(1, 2, 0).numpy()
+    return np.asarray(Image.fromarray(pixels).resize((width, height), Image.Resampling.BOX))
+
+
+def _look(pixels: NDArray[np.uint8]) -> _Look:
+    grey = pixels.mean(2, dtype=np.float32)
+    fine, *coarse = (_curvatures(grey, step) for step in (1, *_COARSE))
+    detail = float((fine / np.maximum(np.max(coarse, 0), 1e-6)).min())
+    black, white = (pixels.max(2) <= _BLACK).mean(), (pixels.min(2) >= _WHITE).mean()
+    return _Look(float(black), float(white), float(grey.std()), detail)
+
+
+def _curvatures(grey: NDArray[np.float32], step: int) -> NDArray[np.float64]:
+    """Returns the mean squared second differences, in four directions, of an image reduced by ``step``."""
+    rows, columns = grey.shape[0] // step, grey.shape[1] // step
+    if min(rows, columns) < 3:
+        return np.zeros(4)
+    small = grey[: rows * step, : columns * step].reshape(rows, step, columns, step).mean((1, 3))
+    found = []
+    for y, x in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        before, after = (small[1 + s * y : rows - 1 + s * y, 1 + s * x : columns - 1 + s * x] for s in (-1, 1))
+        found.append(((2 * small[1:-1, 1:-1] - before - after) ** 2).mean(dtype=np.float64))
+    return np.array(found)
+
+
+def _faults(looks: dict[str, _Look]) -> dict[str, str]:
+    """Returns what is wrong with pictures that show nothing, some of it by comparison with the others."""
+    several = len(looks) >= _FEWEST
+    usual = {name: np.median([getattr(each, name) for each in looks.values()]) for name in ("black", "white", "detail")}
+    faults = {}
+    for name, look in looks.items():
+        for kind, said in (("black", "is black"), ("white", "is over-exposed")):
+            limit = _NEARLY_ALL if several and usual[kind] < _USUAL else _ALL
+            if getattr(look, kind) >= limit:
+                faults[name] = said
+        if name not in faults and look.spread < _FLAT:
+            faults[name] = "is of one colour"
+        if name not in faults and several and look.detail < _BLURRED * usual["detail"]:
+            faults[name] = "is blurred"
+    return faults
+
+
+def _masked(picture: Picture, mask: NDArray[np.float32]) -> Picture:
+    def read(size: tuple[int, int]) -> Frames:
+        frames = picture.read(size)
+        shape = (frames.images.shape[-2], frames.images.shape[-1])
+        own = (resized_mask(mask, shape) > 0.99).astype(np.float32)  # no pixel that is partly on the border
+        known = None if frames.mask is None else frames.mask[0].numpy()
+        joined = joined_masks([own, known])
+        return replace(frames, mask=None if joined is None else torch.from_numpy(joined)[None])
+
+    return replace(picture, read=read)
