@@ -11,6 +11,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
+from vg2gt.data.sources.colmap_model import largest_of, models_in, models_of
 from vg2gt.data.sources.parsing import IMAGE_SUFFIXES
 from vg2gt.data.sources.undistortion import pinhole_camera
 from vg2gt.io import colmap_images, colmap_intrinsics, colmap_pose, read_cameras_json, read_colmap, read_transforms
@@ -24,8 +25,8 @@ def read_cameras(path: str | Path) -> list[NamedCamera]:
     """Reads cameras from a file of any of these kinds; lens distortion is ignored.
 
     Args:
-        path: a ``cameras.json`` of ours or of 3D Gaussian Splatting, a ``transforms.json``, or the folder of a COLMAP
-            model or of a scene with one in ``sparse/0`` or ``sparse``.
+        path: a ``cameras.json`` of ours or of 3D Gaussian Splatting, a ``transforms.json``, a folder with one of them,
+            or the folder of a COLMAP model or of a scene with one, of which the part with most images is read.
 
     Raises:
         FileNotFoundError: if the file does not exist.
@@ -34,7 +35,8 @@ def read_cameras(path: str | Path) -> list[NamedCamera]:
     """
     path = Path(path).expanduser()
     if path.is_dir():
-        return _of_colmap(path)
+        inside = [path / name for name in ("cameras.json", "transforms.json") if (path / name).is_file()]
+        return read_cameras(inside[0]) if inside else _of_colmap(path)
     if not path.is_file():
         raise FileNotFoundError(f"no cameras at {path}")
     content = read_json(path)
@@ -46,8 +48,8 @@ def read_cameras(path: str | Path) -> list[NamedCamera]:
 
 
 def _of_colmap(folder: Path) -> list[NamedCamera]:
-    places = [folder, folder / "sparse" / "0", folder / "sparse"]
-    model = read_colmap(next((place for place in places if colmap_files(place)), folder))
+    split = models_of(folder) or models_of(folder / "dense") or models_in(folder)
+    model = read_colmap(folder if colmap_files(folder) or not split else largest_of(split))
     cameras = []
     for image in colmap_images(model):
         lens = pinhole_camera(image.camera)

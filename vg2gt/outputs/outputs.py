@@ -140,7 +140,7 @@ def scene_figures(scene: Scene) -> dict[str, Any]:
         **refinement_figures(scene),
         **trust_figures(scene),
         "cameras": scene.cameras_from or PREDICTED,
-        **({"frame": scene.frame.name} if scene.frame is not None else {}),
+        **({} if scene.frame is None else {"frame": scene.frame.name, "to_source": scene.frame.to_source.tolist()}),
     }
 
 
