@@ -31,10 +31,11 @@ from vg2gt.data.sources.masks import (
 from vg2gt.data.sources.parsing import IMAGE_SUFFIXES
 from vg2gt.data.transforms import from_bytes, to_bytes
 from vg2gt.io.files import by_number
-from vg2gt.io.image_files import focal_length, image_size, is_panorama, read_color, read_mask, read_mask_file
+from vg2gt.io.image_files import focal_length, image_size, read_color, read_mask, read_mask_file
 from vg2gt.io.images import color_image, has_alpha
 from vg2gt.io.record3d import R3D, is_archive, read_recorded, recorded_files
 from vg2gt.io.video import VIDEO_SUFFIXES, VideoFrames, count_frames, read_video, require_pyav, video_size
+from vg2gt.reconstruction.panoramas import Panorama, find_panoramas, whole_pixels
 
 log = logging.getLogger(__name__)
 
@@ -64,7 +65,7 @@ class Picture:
         path: its file; None if it has no file of its own.
         pose: ``[4, 4]`` float64 given ``world_to_camera``; None if there is none.
         intrinsics: ``[3, 3]`` float64 given intrinsics, at the size of its camera; None if there are none.
-        container: the video that it is a frame of; None: no video.
+        container: the video or panorama that it is a part of; None: none.
         is_metric: whether its camera (and depth) is in metres.
         lens: lens that its file was undistorted from (``undistortion.lens_text``); empty for a pinhole image.
     """
@@ -197,13 +198,13 @@ def _pictures(item: Any, max_images: int | None) -> list[Picture]:
         return _from_memory(item)
     path = existing_path(item)
     if path.is_dir():
-        return [_photo(file) for file in image_files(path)]
+        return _photos(image_files(path))
     if is_archive(path):
         files = recorded_files(path, ".jpg")
         if not files:
             raise ValueError(f"{path} holds no images (rgbd/0.jpg and so on): is it a recording of Record3D?")
         return [_photo(file, read_recorded) for file in files.values()]
-    return _video(path, max_images or VIDEO_FRAMES) if path.suffix.lower() in VIDEO_SUFFIXES else [_photo(path)]
+    return _video(path, max_images or VIDEO_FRAMES) if path.suffix.lower() in VIDEO_SUFFIXES else _photos([path])
 
 
 def image_files(folder: Path) -> list[Path]:
@@ -234,6 +235,34 @@ def _is_image(path: Path) -> bool:
     return path.suffix.lower() in (*IMAGE_SUFFIXES, *HEIC_SUFFIXES) and not path.name.startswith(".")
 
 
+def _photos(files: Sequence[Path]) -> list[Picture]:
+    """Returns photographs; panoramas are cut into the faces of a cube."""
+    photos = {file: _photo(file) for file in files}
+    panoramas = find_panoramas([(file, photo.size) for file, photo in photos.items()])
+    if panoramas:
+        first = next(iter(panoramas)).name
+        log.warning("%d images are 360 degree panoramas, cut into cube faces: %s, ...", len(panoramas), first)
+    return [
+        picture
+        for file, photo in photos.items()
+        for picture in (_faces(photo, file, panoramas[file]) if file in panoramas else [photo])
+    ]
+
+
+def _faces(photo: Picture, path: Path, panorama: Panorama) -> list[Picture]:
+    """Returns the faces of a panorama; they have no file of their own."""
+
+    def face(name: str) -> Picture:
+        def read(size: tuple[int, int]) -> Frames:
+            pixels = panorama.cut(whole_pixels(path, path.stat().st_mtime_ns), name)
+            return frame_of(shrunk(pixels, size), panorama.cut_mask(mask_for(path), name))
+
+        side = panorama.side
+        return Picture(f"{photo.name}-{name}", (side, side), read, focal=side / 2, container=path)
+
+    return [face(name) for name in panorama.faces()]
+
+
 def _photo(path: Path, content_of: Callable[[Path], bytes | None] = lambda _: None) -> Picture:
     """Returns a photograph; ``content_of`` reads files inside an archive."""
     if path.suffix.lower() in HEIC_SUFFIXES:
@@ -252,10 +281,6 @@ def _photo(path: Path, content_of: Callable[[Path], bytes | None] = lambda _: No
     size = image_size(path, "", upright=True, content=content)
     if content is not None:
         return Picture(path.stem, size, read)
-    if is_panorama(path, size):
-        raise ValueError(
-            f"{path} is a 360 degree panorama, which no pinhole camera represents: convert it to cube faces"
-        )
     return Picture(path.stem, size, read, focal=focal_length(path, size), path=path)
 
 

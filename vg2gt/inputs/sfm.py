@@ -60,6 +60,7 @@ _QUALITY = 95  # JPEG quality of the kept images
 FEWEST_POINTS = 20  # minimum number of points of a sound model: a camera that only rotates yields none
 _AT_ONCE = 4  # images per batch of feature extraction, to bound memory
 _PAIRS_AT_ONCE = 256  # pairs per call of the matcher, which indexes the features of every image in each call
+_LARGE_ERROR = 1.1  # pixels, mean reprojection error of photographs that a lens model does not fit
 _STATE = "sfm.json"
 _MASKS = "masks"
 
@@ -126,6 +127,13 @@ def find_cameras(pictures: Sequence[Picture], folder: Path, monitor: Monitor) ->
             "a ground with texture, such as a newspaper, or mark one side: %s",
             len(undecided), len(state["images"]), ", ".join(undecided[:10]),
         )  # fmt: skip
+    wide = [picture.name for picture in pictures if picture.size[1] == 2 * picture.size[0]]
+    badly = state.get("error", 0) > _LARGE_ERROR or len(state["left_out"]) > len(pictures) / 4
+    if badly and 2 * len(wide) > len(pictures):
+        log.warning(
+            "%d images are twice as wide as high and fit badly as photographs: if they are changed 360 degree "
+            "panoramas, give the complete ones, or convert them to cube faces: %s, ...", len(wide), wide[0],
+        )  # fmt: skip
     names = state["images"]
     source = f"{SFM_SOURCE}, {len(names)} of {len(pictures)} images"
     paths = {picture.name: picture.path for picture in pictures}
@@ -179,6 +187,7 @@ def _solve(pictures: Sequence[Picture], folder: Path, key: str, monitor: Monitor
             "images": {name: title for name, title in titles.items() if name in placed},
             "left_out": [title for name, title in titles.items() if name not in placed],
             "other_parts": [[titles[name] for name in sorted(part)] for part in others if part],
+            "error": round(models[0].compute_mean_reprojection_error(), 2),
             "undecided": [titles[name] for name in undecided],
         }
         with whole_folder(folder) as staged:
