@@ -11,7 +11,7 @@ import torch
 
 from vg2gt.geometry.alignment import align_points
 from vg2gt.geometry.cameras import camera_centers
-from vg2gt.inputs import sfm
+from vg2gt.inputs import likely_pairs, sfm
 from vg2gt.inputs.inputs import load_views
 from vg2gt.inputs.pictures import Picture, find_pictures
 from vg2gt.monitor import Monitor
@@ -40,12 +40,12 @@ def test_pairs_of_many_are_neighbours_and_those_that_look_alike() -> None:
     places = rng.integers(0, 100, (PLACES + 1, 30, 128))
     shown = [np.concatenate((places[i % PLACES], places[i % PLACES + 1])) for i in range(2 * PLACES)]
     descriptors = [(rows + rng.integers(0, 20, rows.shape)).astype(np.uint8) for rows in shown]
-    pairs = sfm.likely_pairs(descriptors)
+    pairs = likely_pairs.likely_pairs(descriptors)
     assert all(0 <= before < later < 2 * PLACES for before, later in pairs)
-    assert len(set(pairs)) == len(pairs) <= 2 * PLACES * (len(sfm.DISTANCES) + sfm.ALIKE)
+    assert len(set(pairs)) == len(pairs) <= 2 * PLACES * (len(likely_pairs.DISTANCES) + likely_pairs.ALIKE)
     assert {(i, i + step) for step in (1, 2, 4, 8, 16) for i in range(2 * PLACES - step)} <= set(pairs)
     assert {(i, i + PLACES) for i in range(PLACES)} <= set(pairs)
-    assert sfm.likely_pairs(descriptors) == pairs
+    assert likely_pairs.likely_pairs(descriptors) == pairs
 
 
 def test_many_photographs_are_matched_in_likely_pairs(shared: Path, tmp_path: Path, monkeypatch) -> None:
@@ -59,7 +59,7 @@ def test_many_photographs_are_matched_in_likely_pairs(shared: Path, tmp_path: Pa
         match(database, **options)
 
     monkeypatch.setattr(sfm, "ALL_PAIRS", 5)
-    monkeypatch.setattr(sfm, "ALIKE", 0)
+    monkeypatch.setattr(likely_pairs, "ALIKE", 0)
     monkeypatch.setattr(pycolmap, "match_image_pairs", count)
     pictures = sfm.find_cameras(find_pictures(office_photos(shared, 8)), tmp_path / "sfm", Monitor())
     assert (len(pictures), len(pairs)) == (8, 7 + 6 + 4)

@@ -24,14 +24,16 @@ if TYPE_CHECKING:
 NEAR = 25.0  # degrees between two images' lines of sight to the same points, below which they must show the same
 CELLS = 10  # along the longer side of an image
 FEWEST = 4  # points of either image in a cell that is compared
+EXPECTED = 3.0  # common points of a compared cell, if both images show the same
 COMPARED = 8  # minimum number of compared cells
-DIFFERENT, ALIKE = 0.15, 0.02  # share of the compared cells without a common point: of different places, of the same
-LEAST_ANGLE, FITTING = 0.5, 0.006  # degrees between the rays of a match, its error as a share of the longer side
+DIFFERENT, ALIKE = 0.1, 0.02  # share of the compared cells without a common point: of different places, of the same
+LEAST_ANGLE, FITTING = 1.5, 0.006  # degrees between the rays of a match, its error as a share of the longer side
 SHARED = 0.02  # of the longer side: between a feature and where another match places it
 STRONG = 30  # matches of a pair that must be in the model
 EXPLAINED = 0.2  # of a pair's matches, below which the model contradicts it
 RIVAL = 0.2  # of an image's best matched pair, from which a contradicted pair counts
 
+OUTVOTED = 3  # images that tell a pair apart, beyond twice those that do not, though it looks alike itself
 FEWEST_FALSE = 3  # pairs of different places, below which nothing is removed
 FEWEST_UNDECIDED = 0.1  # of the placed images
 ROUNDS = 3  # maximum number of times that the models are made anew
@@ -100,19 +102,23 @@ class _Seen:
         places: dict[str, list[NDArray[np.float64]]] = {name: [] for name in self.images}
         for pair in sorted(self.pairs):
             rows = matches.raw[pair]
-            found = self._placed(pair, rows)
+            found, along = self._placed(pair, rows)
             fits = np.isfinite(found).all(1)
             for side, name in enumerate(pair):
-                places[name].append(np.concatenate([rows[fits, side, None].astype(float), found[fits]], 1))
+                columns = rows[:, side, None].astype(float), along[:, None], found
+                places[name].append(np.concatenate(columns, 1)[fits])
         self.rows: dict[str, NDArray[np.int64]] = {}
         self.places: dict[str, NDArray[np.float64]] = {}
         for name, parts in places.items():
-            joined = np.concatenate([np.zeros((0, 4)), *parts])
+            joined = np.concatenate([np.zeros((0, 5)), *parts])
+            joined = joined[np.argsort(joined[:, 1], kind="stable")]  # the largest angle between rays first
             rows, first = np.unique(joined[:, 0].astype(np.int64), return_index=True)
-            self.rows[name], self.places[name] = rows, joined[first, 1:]
+            self.rows[name], self.places[name] = rows, joined[first, 2:]
 
-    def _placed(self, pair: tuple[str, str], rows: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Returns the positions ``[m, 3]`` of matches; NaN where they do not fit the cameras."""
+    def _placed(
+        self, pair: tuple[str, str], rows: NDArray[np.int64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Returns the positions ``[m, 3]`` of matches, NaN where they do not fit the cameras, and the rays' cosine."""
         rays = [self._rays[name][rows[:, side]] for side, name in enumerate(pair)]
         centers = [_center(self.poses[name]) for name in pair]
         apart = centers[1] - centers[0]
@@ -129,13 +135,14 @@ class _Seen:
             pixels, ahead = self._pixels(name, self.poses[name], place)
             far = np.linalg.norm(pixels - self._features[name][rows[:, side]], axis=1)
             fits &= ahead & (far < FITTING * self.sizes[name].max())
-        return np.where(fits[:, None], place, np.nan)
+        return np.where(fits[:, None], place, np.nan), along
 
     def _pixels(
         self, name: str, pose: NDArray[np.float64], places: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Returns the pixels ``[n, 2]`` of positions in an image, and whether they are in front of its camera."""
-        inside = places @ pose[:, :3].T + pose[:, 3]
+        with np.errstate(invalid="ignore"):
+            inside = places @ pose[:, :3].T + pose[:, 3]
         ahead = np.isfinite(inside).all(1) & (inside[:, 2] > 1e-6)
         pixels = np.full((len(places), 2), np.nan)
         if ahead.any():
@@ -182,10 +189,14 @@ class _Seen:
             shared = (partner >= 0) & (apart < SHARED * size.max())
         expected = _cells(pixels[near], size)
         theirs = _cells(self._features[other][self.rows[other]], size)
-        compared = (expected >= FEWEST) & (theirs >= FEWEST)
+        common = _cells(pixels[near & shared], size)
+        alike = common > 0
+        if alike.sum() < FEWEST:
+            return None
+        rate = common[alike].sum() / expected[alike].sum()  # of features found again where both show the same
+        compared = (expected >= max(FEWEST, EXPECTED / rate)) & (theirs >= FEWEST)
         if compared.sum() < COMPARED:
             return None
-        common = _cells(pixels[near & shared], size)
         return float((common[compared] == 0).mean())
 
     def _pose_by(
@@ -242,11 +253,14 @@ def false_pairs(models: Sequence[Reconstruction], matches: Matches) -> set[tuple
         for (one, two), alike in verdict.items():
             for first, second in ((one, two), (two, one)):
                 (same if alike else other)[first].add(second)
-        for one, two in sorted(set(matches.pairs) - set(verdict)):
+        for pair in sorted(matches.pairs):
+            one, two = pair
             for_it = len(same[one] & same[two])
             against = len(same[one] & other[two]) + len(other[one] & same[two])
-            if for_it != against:
-                verdict[one, two], changed = for_it > against, True
+            if pair not in verdict and for_it != against:
+                verdict[pair], changed = for_it > against, True
+            elif verdict.get(pair, False) and against >= 2 * for_it + OUTVOTED:  # they look alike by chance
+                verdict[pair], changed = False, True
     return {pair for pair, alike in verdict.items() if not alike}
 
 

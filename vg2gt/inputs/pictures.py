@@ -30,12 +30,12 @@ from vg2gt.data.sources.masks import (
 )
 from vg2gt.data.sources.parsing import IMAGE_SUFFIXES
 from vg2gt.data.transforms import from_bytes, to_bytes
+from vg2gt.inputs.panoramas import Panorama, find_panoramas, whole_pixels
 from vg2gt.io.files import by_number
 from vg2gt.io.image_files import focal_length, image_size, read_color, read_mask, read_mask_file
 from vg2gt.io.images import color_image, has_alpha
 from vg2gt.io.record3d import R3D, is_archive, read_recorded, recorded_files
 from vg2gt.io.video import VIDEO_SUFFIXES, VideoFrames, count_frames, read_video, require_pyav, video_size
-from vg2gt.reconstruction.panoramas import Panorama, find_panoramas, whole_pixels
 
 log = logging.getLogger(__name__)
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from vg2gt.reconstruction.panoramas import FACES, continues
-from vg2gt.reconstruction.pictures import find_pictures
+from vg2gt.inputs.panoramas import FACES, continues
+from vg2gt.inputs.pictures import find_pictures
 
 SIZE = (256, 512)
 NOTE = '<x:xmpmeta><rdf:Description GPano:ProjectionType="equirectangular" {}/></x:xmpmeta>'
