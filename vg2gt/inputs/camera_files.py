@@ -14,18 +14,21 @@ from scipy.spatial.transform import Rotation, RotationSpline
 from vg2gt.data.sources.colmap_model import largest_of, models_in, models_of
 from vg2gt.data.sources.parsing import IMAGE_SUFFIXES
 from vg2gt.data.sources.undistortion import pinhole_camera
+from vg2gt.inputs.foreign import cameras_to_render
 from vg2gt.io import colmap_images, colmap_intrinsics, colmap_pose, read_cameras_json, read_colmap, read_transforms
 from vg2gt.io.cameras_json import NamedCamera, invert_pose
 from vg2gt.io.colmap import colmap_files
 from vg2gt.io.errors import FormatError
 from vg2gt.io.files import by_number, read_json
+from vg2gt.io.photogrammetry import is_camera_file
 
 
 def read_cameras(path: str | Path) -> list[NamedCamera]:
     """Reads cameras from a file of any of these kinds; lens distortion is ignored.
 
     Args:
-        path: a ``cameras.json`` of ours or of 3D Gaussian Splatting, a ``transforms.json``, a folder with one of them,
+        path: a ``cameras.json`` of ours or of 3D Gaussian Splatting, a ``transforms.json``, a file of Metashape,
+            RealityScan, Bundler or VisualSFM, a folder with a JSON file,
             or the folder of a COLMAP model or of a scene with one, of which the part with most images is read.
 
     Raises:
@@ -39,6 +42,9 @@ def read_cameras(path: str | Path) -> list[NamedCamera]:
         return read_cameras(inside[0]) if inside else _of_colmap(path)
     if not path.is_file():
         raise FileNotFoundError(f"no cameras at {path}")
+    if is_camera_file(path):
+        folder = path.resolve().parent
+        return cameras_to_render(path, [f for f in folder.rglob("*") if f.suffix.lower() in IMAGE_SUFFIXES])
     content = read_json(path)
     if isinstance(content, dict) and "frames" in content:
         return _of_transforms(path)
