@@ -9,7 +9,7 @@ are removed. Where nothing surrounds the sides, images whose matches contradict 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,7 +33,7 @@ STRONG = 30  # matches of a pair that must be in the model
 EXPLAINED = 0.2  # of a pair's matches, below which the model contradicts it
 RIVAL = 0.2  # of an image's best matched pair, from which a contradicted pair counts
 
-OUTVOTED = 3  # images that tell a pair apart, beyond twice those that do not, though it looks alike itself
+OUTVOTED = 2  # images that tell a pair apart, beyond twice those that do not, though it looks alike itself
 FEWEST_FALSE = 3  # pairs of different places, below which nothing is removed
 FEWEST_UNDECIDED = 0.1  # of the placed images
 ROUNDS = 3  # maximum number of times that the models are made anew
@@ -226,7 +226,7 @@ def _cells(pixels: NDArray[np.float64], size: NDArray[np.int64]) -> NDArray[np.i
     return np.bincount(cells[:, 1] * CELLS + cells[:, 0], minlength=CELLS * CELLS)
 
 
-def false_pairs(models: Sequence[Reconstruction], matches: Matches) -> set[tuple[str, str]]:
+def false_pairs(models: Sequence[Reconstruction], matches: Matches, fewest: int = FEWEST_FALSE) -> set[tuple[str, str]]:
     """Returns the pairs of images whose matches are of equal sides of different places.
 
     Pairs that are near each other are compared directly. Those that remain unclear follow their neighbours: a pair is
@@ -235,6 +235,7 @@ def false_pairs(models: Sequence[Reconstruction], matches: Matches) -> set[tuple
     Args:
         models: models of the images, which may be folded.
         matches: verified matches.
+        fewest: minimum number of pairs that show different places; with fewer, none is false.
     """
     verdict: dict[tuple[str, str], bool] = {}  # True: of the same place
     for model in models:
@@ -243,25 +244,34 @@ def false_pairs(models: Sequence[Reconstruction], matches: Matches) -> set[tuple
             share = seen.different(pair, rows) if pair in seen.pairs else None
             if share is not None and (share >= DIFFERENT or share <= ALIKE):
                 verdict[pair] = share <= ALIKE
-    if sum(not alike for alike in verdict.values()) < FEWEST_FALSE:
+    if sum(not alike for alike in verdict.values()) < fewest:
         return set()
     changed = True
     while changed:
-        changed = False
-        same: dict[str, set[str]] = {name: set() for name in matches.features}
-        other: dict[str, set[str]] = {name: set() for name in matches.features}
-        for (one, two), alike in verdict.items():
-            for first, second in ((one, two), (two, one)):
-                (same if alike else other)[first].add(second)
-        for pair in sorted(matches.pairs):
-            one, two = pair
-            for_it = len(same[one] & same[two])
-            against = len(same[one] & other[two]) + len(other[one] & same[two])
-            if pair not in verdict and for_it != against:
-                verdict[pair], changed = for_it > against, True
-            elif verdict.get(pair, False) and against >= 2 * for_it + OUTVOTED:  # they look alike by chance
-                verdict[pair], changed = False, True
+        votes = _votes(verdict, matches)
+        # first those that look alike by chance
+        change = {
+            pair: False for pair, (by, against) in votes.items() if verdict.get(pair) and against >= 2 * by + OUTVOTED
+        }
+        change = change or {
+            pair: by > against for pair, (by, against) in votes.items() if pair not in verdict and by != against
+        }
+        verdict |= change
+        changed = bool(change)
     return {pair for pair, alike in verdict.items() if not alike}
+
+
+def _votes(verdict: Mapping[tuple[str, str], bool], matches: Matches) -> dict[tuple[str, str], tuple[int, int]]:
+    """Returns for each pair how many other images are of the same place as both, and as only one of them."""
+    same: dict[str, set[str]] = {name: set() for name in matches.features}
+    other: dict[str, set[str]] = {name: set() for name in matches.features}
+    for (one, two), alike in verdict.items():
+        for first, second in ((one, two), (two, one)):
+            (same if alike else other)[first].add(second)
+    return {
+        (one, two): (len(same[one] & same[two]), len(same[one] & other[two]) + len(other[one] & same[two]))
+        for one, two in matches.pairs
+    }
 
 
 def remove(database: Path, pairs: set[tuple[str, str]]) -> None:
@@ -306,8 +316,8 @@ def unfold(
         models: models made with all matches.
         again: makes the models anew.
     """
-    for _ in range(ROUNDS):
-        found = false_pairs(models, matches)
+    for number in range(ROUNDS):
+        found = false_pairs(models, matches, FEWEST_FALSE if number == 0 else 1)
         if not found:
             break
         remove(database, found)

@@ -82,11 +82,10 @@ class Panorama:
     def cut_mask(self, mask: NDArray[np.float32] | None, face: str) -> NDArray[np.float32] | None:
         """Returns the pixel weights of a face: those of the image, and 0 where it shows nothing; None: all 1."""
         places, (height, width) = self.places(face), self.size
-        inside = ((places >= -0.5) & (places <= np.array([width, height]) - 0.5)).all(-1)
-        if self.size == self.whole:
-            inside[:] = True
+        inside = np.all((places >= -0.5) & (places <= np.array([width, height]) - 0.5), axis=-1)
+        inside = np.asarray(inside | (self.size == self.whole))
         if mask is None:
-            return None if inside.all() else inside.astype(np.float32)
+            return None if inside.all() else np.asarray(inside, np.float32)
         found = self._sample(torch.from_numpy(mask)[None, None], face)[0, 0].numpy()
         return np.where(inside, found, 0).astype(np.float32)
 

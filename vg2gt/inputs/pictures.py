@@ -34,6 +34,7 @@ from vg2gt.inputs.panoramas import Panorama, find_panoramas, whole_pixels
 from vg2gt.io.files import by_number
 from vg2gt.io.image_files import focal_length, image_size, read_color, read_mask, read_mask_file
 from vg2gt.io.images import color_image, has_alpha
+from vg2gt.io.photogrammetry import is_camera_file
 from vg2gt.io.record3d import R3D, is_archive, read_recorded, recorded_files
 from vg2gt.io.video import VIDEO_SUFFIXES, VideoFrames, count_frames, read_video, require_pyav, video_size
 
@@ -123,10 +124,24 @@ def check_pictures(paths: Sequence[str]) -> None:
     for path in map(existing_path, paths):
         if path.suffix.lower() in VIDEO_SUFFIXES:
             require_pyav(f"reading {path}")
-        elif path.is_file():
+        elif path.is_file() and not is_camera_file(path):
             _pictures(path, 1)
-        elif not any(file.suffix.lower() in _HOLDS_PICTURES for file in path.rglob("*")):
+        elif path.is_dir() and not any(file.suffix.lower() in _HOLDS_PICTURES for file in path.rglob("*")):
             image_files(path)
+
+
+def count_pictures(paths: Sequence[str], max_images: int | None = None) -> int:
+    """Returns about how many pictures files and folders give, without reading any; those of archives are not counted."""
+    count = 0
+    for path in map(existing_path, paths):
+        if path.is_dir():
+            try:
+                count += len(image_files(path))
+            except ValueError:  # a recording of another layout
+                continue
+        else:
+            count += VIDEO_FRAMES if path.suffix.lower() in VIDEO_SUFFIXES else 1
+    return count if max_images is None else min(count, max_images)
 
 
 def as_items(images: ImagesLike) -> list[Any]:
@@ -199,6 +214,8 @@ def _pictures(item: Any, max_images: int | None) -> list[Picture]:
     path = existing_path(item)
     if path.is_dir():
         return _photos(image_files(path))
+    if is_camera_file(path):
+        raise ValueError(f"{path} is a file of cameras, which are not used here: give the folder of its images")
     if is_archive(path):
         files = recorded_files(path, ".jpg")
         if not files:

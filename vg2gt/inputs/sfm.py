@@ -33,7 +33,7 @@ from vg2gt.data.sources.colmap_model import COLMAP, model_folder_of
 from vg2gt.data.sources.masks import mask_beside
 from vg2gt.data.transforms import reduce_to_fit, to_bytes
 from vg2gt.inputs.folds import Matches, unfold
-from vg2gt.inputs.given_cameras import LAYOUTS, recording_pictures
+from vg2gt.inputs.given_cameras import LAYOUTS, SFM_STATE, recording_pictures
 from vg2gt.inputs.likely_pairs import likely_pairs
 from vg2gt.inputs.motion import check_motion, why_not_placed
 from vg2gt.inputs.pictures import SFM_SOURCE, UNKNOWN_LENS, Picture, digest
@@ -61,7 +61,6 @@ FEWEST_POINTS = 20  # minimum number of points of a sound model: a camera that o
 _AT_ONCE = 4  # images per batch of feature extraction, to bound memory
 _PAIRS_AT_ONCE = 256  # pairs per call of the matcher, which indexes the features of every image in each call
 _LARGE_ERROR = 1.1  # pixels, mean reprojection error of photographs that a lens model does not fit
-_STATE = "sfm.json"
 _MASKS = "masks"
 
 _OTHERWISE = f"or put camera files next to them ({LAYOUTS}), or use a backend that needs no cameras, such as da3_small"
@@ -104,7 +103,7 @@ def find_cameras(pictures: Sequence[Picture], folder: Path, monitor: Monitor) ->
     state = _read_state(folder, key)
     if state is None:
         require_pycolmap()
-        if folder.exists() and any(folder.iterdir()) and not (folder / _STATE).is_file():
+        if folder.exists() and any(folder.iterdir()) and not (folder / SFM_STATE).is_file():
             raise FileExistsError(f"{folder} already exists and contains other files; move it or choose another --out")
         if len(pictures) < 2:
             raise ValueError(f"a single image is not enough to estimate depth or cameras: {ADVICE}")
@@ -156,7 +155,7 @@ def _key(pictures: Sequence[Picture]) -> str:
 def _read_state(folder: Path, key: str) -> dict[str, Any] | None:
     """Reads the state of a result folder; None if it is missing, damaged, incomplete, or of other pictures."""
     try:
-        state = read_json(folder / _STATE)
+        state = read_json(folder / SFM_STATE)
         same = state["key"] == key and all((folder / "images" / name).is_file() for name in state["images"])
     except (FormatError, OSError, KeyError, TypeError):
         return None
@@ -195,7 +194,7 @@ def _solve(pictures: Sequence[Picture], folder: Path, key: str, monitor: Monitor
                 shutil.move(work / "undistorted" / part, staged / part)
             if (work / _MASKS).exists():
                 shutil.move(work / "undistorted-masks" / "images", staged / "masks")
-            write_json(staged / _STATE, state)
+            write_json(staged / SFM_STATE, state)
     return state
 
 
