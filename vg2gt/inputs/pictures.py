@@ -131,7 +131,7 @@ def check_pictures(paths: Sequence[str]) -> None:
 
 
 def count_pictures(paths: Sequence[str], max_images: int | None = None) -> int:
-    """Returns about how many pictures files and folders give, without reading any; those of archives are not counted."""
+    """Returns about how many pictures files and folders give, without reading any; an archive counts as one."""
     count = 0
     for path in map(existing_path, paths):
         if path.is_dir():
