@@ -8,12 +8,16 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
+from tests.data.sources.layouts import pixels
 from vg2gt.geometry.alignment import align_points
 from vg2gt.geometry.cameras import camera_centers
-from vg2gt.inputs import sfm
+from vg2gt.inputs import likely_pairs, sfm
+from vg2gt.inputs.given_cameras import given_pictures
 from vg2gt.inputs.inputs import load_views
 from vg2gt.inputs.pictures import Picture, find_pictures
+from vg2gt.io import colmap_from_views, write_colmap
 from vg2gt.monitor import Monitor
 from vg2gt.types import Cameras
 
@@ -40,12 +44,12 @@ def test_pairs_of_many_are_neighbours_and_those_that_look_alike() -> None:
     places = rng.integers(0, 100, (PLACES + 1, 30, 128))
     shown = [np.concatenate((places[i % PLACES], places[i % PLACES + 1])) for i in range(2 * PLACES)]
     descriptors = [(rows + rng.integers(0, 20, rows.shape)).astype(np.uint8) for rows in shown]
-    pairs = sfm.likely_pairs(descriptors)
+    pairs = likely_pairs.likely_pairs(descriptors)
     assert all(0 <= before < later < 2 * PLACES for before, later in pairs)
-    assert len(set(pairs)) == len(pairs) <= 2 * PLACES * (len(sfm.DISTANCES) + sfm.ALIKE)
+    assert len(set(pairs)) == len(pairs) <= 2 * PLACES * (len(likely_pairs.DISTANCES) + likely_pairs.ALIKE)
     assert {(i, i + step) for step in (1, 2, 4, 8, 16) for i in range(2 * PLACES - step)} <= set(pairs)
     assert {(i, i + PLACES) for i in range(PLACES)} <= set(pairs)
-    assert sfm.likely_pairs(descriptors) == pairs
+    assert likely_pairs.likely_pairs(descriptors) == pairs
 
 
 def test_many_photographs_are_matched_in_likely_pairs(shared: Path, tmp_path: Path, monkeypatch) -> None:
@@ -59,7 +63,7 @@ def test_many_photographs_are_matched_in_likely_pairs(shared: Path, tmp_path: Pa
         match(database, **options)
 
     monkeypatch.setattr(sfm, "ALL_PAIRS", 5)
-    monkeypatch.setattr(sfm, "ALIKE", 0)
+    monkeypatch.setattr(likely_pairs, "ALIKE", 0)
     monkeypatch.setattr(pycolmap, "match_image_pairs", count)
     pictures = sfm.find_cameras(find_pictures(office_photos(shared, 8)), tmp_path / "sfm", Monitor())
     assert (len(pictures), len(pairs)) == (8, 7 + 6 + 4)
@@ -112,3 +116,18 @@ def test_small_images_are_doubled_before_features_are_searched():
     assert sfm.feature_settings([large] * 23 + [small]) == (1280, 4096, -1)
     assert sfm.feature_settings([large] * 300) == (1600, 2048, 0)
     assert sfm.feature_settings([small] * 300) == (1024, 2048, -1)
+
+
+def test_a_kept_folder_has_the_names_of_the_photographs(frames, tmp_path: Path) -> None:
+    """``vg2gt reconstruct OUT/sfm``; a damaged list of names is ignored."""
+    pytest.importorskip("pycolmap")
+    kept, numbers = tmp_path / "sfm", [f"{number:06d}" for number in range(4)]
+    (kept / "images").mkdir(parents=True)
+    for number, image in zip(numbers, pixels(frames), strict=True):
+        Image.fromarray(image).save(kept / "images" / f"{number}.jpg")
+    cameras = Cameras(frames.world_to_camera[None].double(), frames.intrinsics[None].double(), (84, 112))
+    write_colmap(kept / "sparse", colmap_from_views(cameras, [f"{number}.jpg" for number in numbers]))
+    (kept / "sfm.json").write_text(json.dumps({"images": {f"{n}.jpg": f"IMG_{n[-1]}" for n in numbers}}))
+    assert [picture.name for picture in given_pictures(kept) or []] == [f"IMG_{number}" for number in range(4)]
+    (kept / "sfm.json").write_text("{")
+    assert [picture.name for picture in given_pictures(kept) or []] == numbers

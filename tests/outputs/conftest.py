@@ -1,5 +1,5 @@
 """The same scene and recording as for reconstruction."""
 
-from tests.reconstruction.conftest import frames, ready, recording, scene
+from tests.reconstruction.conftest import folder, frames, model, ready, recording, scene
 
-__all__ = ["frames", "ready", "recording", "scene"]
+__all__ = ["folder", "frames", "model", "ready", "recording", "scene"]

@@ -10,6 +10,7 @@ import torch
 import trimesh
 from PIL import Image
 
+from tests.reconstruction.conftest import run
 from vg2gt import io
 from vg2gt.geometry.cameras import project
 from vg2gt.outputs.output_names import OUTPUTS
@@ -121,3 +122,30 @@ def test_nothing_is_replaced_unasked(written: Path, scene: Scene, tmp_path: Path
     (tmp_path / "color" / "stale.png").touch()
     write_outputs(scene, tmp_path, ["color.png"], overwrite=True)
     assert not (tmp_path / "color" / "stale.png").exists()
+
+
+def test_names_of_244_characters_and_folders_of_cameras_are_kept(folder: Path, model, tmp_path: Path) -> None:
+    """As COLMAP allows: files of equal names in the folder of each camera, and names as long as a disk allows."""
+    long = "n" * 240 + ".png"
+    for number, name in enumerate(("front/1.png", "back/1.png", f"back/{long}")):
+        (tmp_path / "rig" / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(folder / "images" / f"{8 + number:03d}.png", tmp_path / "rig" / name)
+    scene = reconstruct_with(model, [tmp_path / "rig" / name for name in ("front/1.png", "back/1.png", f"back/{long}")])
+    scene.save(tmp_path / "out", ["colmap", "nerfstudio", "color.png"])
+    names = {"front/1.png", "back/1.png", f"back/{long}"}
+    images = io.colmap_images(io.read_colmap(tmp_path / "out" / "colmap" / "sparse" / "0"))
+    assert {image.name for image in images} == names
+    for name in names:
+        for kind in ("colmap", "nerfstudio"):
+            assert (tmp_path / "out" / kind / "images" / name).read_bytes() == (tmp_path / "rig" / name).read_bytes()
+    frames = io.read_transforms(tmp_path / "out" / "nerfstudio" / "transforms.json").frames
+    assert {frame.file_path for frame in frames} == {f"images/{name}" for name in names}
+    assert (tmp_path / "out" / "color" / long).is_file()
+
+
+def test_a_full_disk_is_noticed_before_any_work(folder: Path, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 10**9 - 10**6, 10**6))  # type: ignore[attr-defined]
+    monkeypatch.setattr("vg2gt.runs.load.build_model", lambda *_: pytest.fail("built a model"))
+    with pytest.raises(SystemExit, match=r"has 1 MB left, but at least 2 MB are needed for 4 images"):
+        run(folder, "--out", tmp_path / "new" / "out")
+    assert not (tmp_path / "new").exists()

@@ -163,15 +163,6 @@ def test_a_damaged_photograph_is_named(photos: Path, tmp_path: Path) -> None:
         load_views(find_pictures(folder), SIZE, Monitor())
 
 
-def test_panoramas_are_refused_in_one_line(tmp_path: Path) -> None:
-    Image.new("RGB", (200, 100)).save(tmp_path / "wide.jpg")
-    assert len(find_pictures(tmp_path)) == 1
-    note = b'<x:xmpmeta><rdf:Description GPano:ProjectionType="equirectangular"/></x:xmpmeta>'
-    Image.new("RGB", (200, 100)).save(tmp_path / "sphere.jpg", xmp=note)
-    with pytest.raises(ValueError, match=r"sphere\.jpg is a 360 degree panorama.*cube faces"):
-        find_pictures(tmp_path)
-
-
 def test_images_and_a_photograph_beside_their_folder(folder: Path, caplog) -> None:
     shutil.copy(folder / "images" / NAMES[0], folder / "preview.png")
     assert len(find_pictures(folder)) == 4

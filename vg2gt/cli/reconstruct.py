@@ -129,8 +129,8 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
 def _check(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     """Checks all arguments before weights are downloaded or any work is done."""
     from vg2gt.inputs.cameras import check_inputs
-    from vg2gt.inputs.pictures import check_limit
-    from vg2gt.outputs.outputs import check_folder, check_outputs
+    from vg2gt.inputs.pictures import check_limit, count_pictures
+    from vg2gt.outputs.outputs import check_folder, check_outputs, check_space
     from vg2gt.reconstruction.trust import check_trust
     from vg2gt.reconstruction.windows.store import window_size
     from vg2gt.runs.load import backend_class
@@ -147,6 +147,7 @@ def _check(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     window_size(options.window, 0)
     check_trust(options.min_confidence, options.drop)
     check_inputs(backend_class(options.ckpt, overrides), options.images, options.poses)
+    check_space(options.out, options.save, count_pictures(options.images, options.max_images))
 
 
 def _scene(options: argparse.Namespace, ready: Pipeline, overrides: Sequence[str], monitor: Monitor) -> Scene:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -52,12 +53,14 @@ def main(argv: Sequence[str] | None = None) -> None:
     add_common_flags(arguments, DEFAULT)
     arguments.set_defaults(save=None)
     options = arguments.parse_args(argv)
+    logging.basicConfig(level=logging.WARNING, format="%(message)s")
     with errors_in_one_line():
         run(options)
 
 
 def run(options: argparse.Namespace) -> None:
     """Renders the views and writes the outputs."""
+    from vg2gt.inputs.scene_cameras import cameras_of_scene
     from vg2gt.io import read_gaussians
     from vg2gt.io.video import require_pyav
     from vg2gt.monitor import Monitor
@@ -82,6 +85,8 @@ def run(options: argparse.Namespace) -> None:
     gaussians = read_gaussians(scene).to(choose_device(options.device))
     if not len(gaussians):
         raise ValueError(f"{scene} holds no Gaussians; there is nothing to render")
+    if still is not None:
+        still = cameras_of_scene(still[0], scene, gaussians), *still[1:]
     near = near_of(scene.parent, Renderer().near) if options.near is None else options.near
     renderer = Renderer(mode=options.mode, depth=options.depth, near=near)
     cameras, fps, note = still or _moving(options, scene, gaussians, renderer)
@@ -124,6 +129,7 @@ def _moving(
 ) -> tuple[list[NamedCamera], float, str]:
     """Returns the cameras of the frames of an orbit or a path, the frame rate, and what the path is."""
     from vg2gt.inputs.camera_files import read_cameras
+    from vg2gt.inputs.scene_cameras import cameras_of_scene
     from vg2gt.reconstruction.camera_path import SIZE, glide, median_depth, orbit, read_camera_path
 
     size, fps = options.size or SIZE, options.fps or FPS
@@ -134,7 +140,7 @@ def _moving(
         if options.seconds is not None:
             raise ValueError(f"{options.path} sets the duration by its frames: leave --seconds away, or change --fps")
     else:
-        cameras = read_cameras(options.path)
+        cameras = cameras_of_scene(read_cameras(options.path), scene, gaussians)
         unit = median_depth(gaussians, cameras, renderer) or 1.0
         found = glide(cameras, unit, size, fps, options.seconds)
     return found.cameras, found.fps, NOTES[found.kind]

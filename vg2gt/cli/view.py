@@ -50,6 +50,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Reads the scene, writes the page and opens it if asked."""
     from vg2gt.inputs.camera_files import read_cameras
+    from vg2gt.inputs.scene_cameras import cameras_of_scene
     from vg2gt.io import read_gaussians
     from vg2gt.outputs.saved import near_of
     from vg2gt.rendering import Renderer
@@ -63,7 +64,8 @@ def run(arguments: argparse.Namespace) -> None:
     title = arguments.title or scene_title(arguments.scene)
     scene = ViewerScene(gaussians, title=title, near=near_of(arguments.scene.parent, Renderer().near))
     if arguments.cameras is not None:
-        cameras, folder = read_cameras(arguments.cameras), arguments.cameras.parent
+        cameras = cameras_of_scene(read_cameras(arguments.cameras), arguments.scene, gaussians)
+        folder = arguments.cameras.parent
         sources = [folder, folder / VIEWS] if arguments.images is None else [arguments.images]
         scene = replace(scene, cameras=cameras, pictures=_pictures(cameras, sources))
     path = write_viewer_html(arguments.html or arguments.scene.with_suffix(".html"), scene)

@@ -11,21 +11,25 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
+from vg2gt.data.sources.colmap_model import largest_of, models_in, models_of
 from vg2gt.data.sources.parsing import IMAGE_SUFFIXES
 from vg2gt.data.sources.undistortion import pinhole_camera
+from vg2gt.inputs.foreign import cameras_to_render
 from vg2gt.io import colmap_images, colmap_intrinsics, colmap_pose, read_cameras_json, read_colmap, read_transforms
 from vg2gt.io.cameras_json import NamedCamera, invert_pose
 from vg2gt.io.colmap import colmap_files
 from vg2gt.io.errors import FormatError
 from vg2gt.io.files import by_number, read_json
+from vg2gt.io.photogrammetry import is_camera_file
 
 
 def read_cameras(path: str | Path) -> list[NamedCamera]:
     """Reads cameras from a file of any of these kinds; lens distortion is ignored.
 
     Args:
-        path: a ``cameras.json`` of ours or of 3D Gaussian Splatting, a ``transforms.json``, or the folder of a COLMAP
-            model or of a scene with one in ``sparse/0`` or ``sparse``.
+        path: a ``cameras.json`` of ours or of 3D Gaussian Splatting, a ``transforms.json``, a file of Metashape,
+            RealityScan, Bundler or VisualSFM, a folder with a JSON file,
+            or the folder of a COLMAP model or of a scene with one, of which the part with most images is read.
 
     Raises:
         FileNotFoundError: if the file does not exist.
@@ -34,9 +38,13 @@ def read_cameras(path: str | Path) -> list[NamedCamera]:
     """
     path = Path(path).expanduser()
     if path.is_dir():
-        return _of_colmap(path)
+        inside = [path / name for name in ("cameras.json", "transforms.json") if (path / name).is_file()]
+        return read_cameras(inside[0]) if inside else _of_colmap(path)
     if not path.is_file():
         raise FileNotFoundError(f"no cameras at {path}")
+    if is_camera_file(path):
+        folder = path.resolve().parent
+        return cameras_to_render(path, [f for f in folder.rglob("*") if f.suffix.lower() in IMAGE_SUFFIXES])
     content = read_json(path)
     if isinstance(content, dict) and "frames" in content:
         return _of_transforms(path)
@@ -46,8 +54,8 @@ def read_cameras(path: str | Path) -> list[NamedCamera]:
 
 
 def _of_colmap(folder: Path) -> list[NamedCamera]:
-    places = [folder, folder / "sparse" / "0", folder / "sparse"]
-    model = read_colmap(next((place for place in places if colmap_files(place)), folder))
+    split = models_of(folder) or models_of(folder / "dense") or models_in(folder)
+    model = read_colmap(folder if colmap_files(folder) or not split else largest_of(split))
     cameras = []
     for image in colmap_images(model):
         lens = pinhole_camera(image.camera)

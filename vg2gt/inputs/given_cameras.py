@@ -21,6 +21,7 @@ from vg2gt.data.sources.rgbd import RGBDFolder
 from vg2gt.data.sources.undistortion import size_on_disk, undistortion_of
 from vg2gt.geometry.cameras import resize_intrinsics
 from vg2gt.inputs.folders import image_files, image_folders, is_photo
+from vg2gt.inputs.foreign import camera_files_in, foreign_cameras
 from vg2gt.inputs.pictures import (
     UNKNOWN_LENS,
     ImagesLike,
@@ -36,22 +37,31 @@ from vg2gt.inputs.pictures import (
     with_unique_names,
 )
 from vg2gt.io.cameras_json import NamedCamera, Photo, read_cameras_json
+from vg2gt.io.errors import FormatError
+from vg2gt.io.files import read_json
 from vg2gt.io.image_files import is_damaged, read_color
 from vg2gt.io.nerfstudio import read_transforms
+from vg2gt.io.photogrammetry import is_camera_file
 from vg2gt.io.record3d import R3D
 
 log = logging.getLogger(__name__)
 
+SFM_STATE = "sfm.json"
+"""File in a folder of structure from motion that identifies and names its photographs."""
 _CAMERAS, _TRANSFORMS = "cameras.json", "transforms.json"
-LAYOUTS = f"{_CAMERAS}, {_TRANSFORMS}, a COLMAP model in sparse/0, or poses.txt with K.txt"
+LAYOUTS = (
+    f"{_CAMERAS}, {_TRANSFORMS}, a COLMAP model in sparse/0, cameras of Metashape (.xml), RealityScan (.csv), Bundler "
+    "(bundle.out) or VisualSFM (.nvm), or poses.txt with K.txt"
+)
 
 
 def given_pictures(images: ImagesLike, max_images: int | None = None, depth: bool = False) -> list[Picture] | None:
     """Lists the pictures whose cameras are in files next to them.
 
     The search order is ``cameras.json``, ``transforms.json`` (or Blender's ``transforms_train.json``), a COLMAP model,
-    a recording with poses (with or without depth). The search covers the folder of the images, the folder above it,
-    and ``dense/`` of a COLMAP workspace whose images are only there.
+    a recording with poses (with or without depth), a file of Metashape, RealityScan, Bundler or VisualSFM. The search
+    covers the folder of the images, the folder above it, and ``dense/`` of a COLMAP workspace whose images are only
+    there.
 
     Args:
         images: a folder, image files, an ``.r3d`` file, or a sequence of these.
@@ -124,7 +134,7 @@ def _by_folder(paths: Sequence[Path]) -> dict[Path, list[Path] | None]:
     """Groups inputs by folder: a folder or recording as a whole (None), single images by their folder."""
     groups: dict[Path, list[Path] | None] = {}
     for path in paths:
-        if path.is_dir() or app_of(path):
+        if path.is_dir() or app_of(path) or is_camera_file(path):
             groups[path] = None
         elif (files := groups.setdefault(path.parent, [])) is not None:
             files.append(path)
@@ -143,6 +153,8 @@ def _only(pictures: list[Picture], files: list[Path], folder: Path) -> list[Pict
 
 def _given(folder: Path, depth: bool) -> list[Picture] | None:
     """Returns the pictures of a folder or recording with the cameras in there, or else one folder up."""
+    if is_camera_file(folder):
+        return None if depth else _of_camera_file(folder)
     inside = image_folders(folder) if folder.is_dir() else []
     places = [(folder, inside[0].name if inside else ".")]
     if not inside and (folder / "dense" / "images").is_dir():  # a COLMAP workspace without its distorted originals
@@ -163,6 +175,7 @@ def _given(folder: Path, depth: bool) -> list[Picture] | None:
         if pictures is not None and above:  # the cameras may be those of other photographs
             pictures = [each for each in pictures if each.path and _is_in(each.path, folder.resolve())] or None
         if pictures is not None:
+            pictures = _with_titles(pictures, place / SFM_STATE)
             _name_missing(pictures, place / images, others)
             return pictures
     return None
@@ -176,10 +189,19 @@ def _at(place: Path, images: str, depth: bool, above: bool) -> tuple[list[Pictur
             return pictures, set()
     source = _source(place, images, depth)
     if source is None or (above and isinstance(source, RGBDFolder) and len(source.scenes) > 1):
-        return None, set()
+        return (None if depth else _from_programs(place, place / images, above)), set()
     pictures = recording_pictures(source)
     index = source.scene_index(source.scenes[0])
     return pictures, {file.resolve() for file in (*index.color, *index.depth)}
+
+
+def _with_titles(pictures: list[Picture], state: Path) -> list[Picture]:
+    """Returns pictures found by structure from motion with the names of the photographs instead of their numbers."""
+    try:
+        titles = read_json(state)["images"] if state.is_file() else {}
+        return [replace(each, name=str(titles.get(f"{each.name}.jpg", each.name))) for each in pictures]
+    except (FormatError, KeyError, AttributeError):  # a damaged file of names
+        return pictures
 
 
 def _may_be_of(place: Path, folder: Path) -> bool:
@@ -272,14 +294,43 @@ def _from_cameras_json(path: Path, folder: Path) -> list[Picture] | None:
     return pictures
 
 
-def _photo(path: Path, camera: NamedCamera, cameras: Path) -> Picture:
+def _of_camera_file(path: Path) -> list[Picture]:
+    """Returns the pictures that a file of another program names, in its folder or one folder up."""
+    for place in (path.parent, path.resolve().parent.parent):
+        try:
+            files = image_files(place)
+        except ValueError:
+            continue
+        if found := foreign_cameras(path, files):
+            return [_photo(file, camera, path, as_stored=True) for file, camera in found]
+    raise DataError(f"{path} names no image next to it: put it into the folder of its images, or one folder up")
+
+
+def _from_programs(place: Path, folder: Path, above: bool) -> list[Picture] | None:
+    """Returns pictures of a folder with cameras of other programs; of several files, the one that names most counts."""
+    cameras = camera_files_in(place)
+    if not cameras:
+        return None
+    files = image_files(folder)
+    found = {path: foreign_cameras(path, files) for path in cameras}
+    path, named = max(found.items(), key=lambda item: len(item[1]))
+    if not named:
+        if above:
+            return None
+        raise DataError(f"{path} names none of the {len(files)} images in {folder}, such as {files[0].name}")
+    if len(cameras) > 1:
+        log.warning("the cameras of %s are used; ignored: %s", path, ", ".join(str(p) for p in cameras if p != path))
+    return [_photo(file, camera, path, as_stored=True) for file, camera in named]
+
+
+def _photo(path: Path, camera: NamedCamera, cameras: Path, as_stored: bool = False) -> Picture:
     """Returns a photograph with its camera, that of the whole photograph if the file has it."""
     photo = camera.photo
     if photo is None or photo.name != path.name:
         photo = Photo(path.name, camera.width, camera.height, camera.intrinsics)
     undistortion = undistortion_of(photo.lens) if photo.lens else None
     expected = undistortion.lens_size if undistortion else (photo.height, photo.width)
-    size, upright = size_on_disk(path, path.parent.name, expected, str(cameras), as_stored=False)
+    size, upright = size_on_disk(path, path.parent.name, expected, str(cameras), as_stored)
     intrinsics = torch.from_numpy(photo.intrinsics)
     pose = torch.from_numpy(camera.world_to_camera)
 
@@ -300,7 +351,7 @@ def _photo(path: Path, camera: NamedCamera, cameras: Path) -> Picture:
         path.stem,
         (photo.height, photo.width) if undistortion else size,
         read,
-        f"{_CAMERAS} {cameras.parent}",
+        f"{cameras.name} {cameras.parent}",
         path=path,
         pose=camera.world_to_camera,
         intrinsics=photo.intrinsics,

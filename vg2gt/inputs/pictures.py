@@ -23,17 +23,11 @@ from vg2gt.data.sources.masks import FOLDER as MASKS
 from vg2gt.data.sources.masks import joined_masks, mask_beside, resized_mask, warn_without_mask
 from vg2gt.data.transforms import from_bytes, to_bytes
 from vg2gt.inputs.folders import HEIC_SUFFIXES, PHOTO_SUFFIXES, image_files, is_photo, name_passed_over
+from vg2gt.inputs.panoramas import Panorama, find_panoramas, whole_pixels
 from vg2gt.io.errors import DataError
-from vg2gt.io.image_files import (
-    focal_length,
-    image_size,
-    is_damaged,
-    is_panorama,
-    read_color,
-    read_mask,
-    read_mask_file,
-)
+from vg2gt.io.image_files import focal_length, image_size, is_damaged, read_color, read_mask, read_mask_file
 from vg2gt.io.images import color_image, has_alpha
+from vg2gt.io.photogrammetry import is_camera_file
 from vg2gt.io.record3d import R3D, is_archive, read_recorded, recorded_files
 from vg2gt.io.video import VIDEO_SUFFIXES, VideoFrames, count_frames, read_video, require_pyav, video_size
 
@@ -64,7 +58,7 @@ class Picture:
         path: its file; None if it has no file of its own.
         pose: ``[4, 4]`` float64 given ``world_to_camera``; None if there is none.
         intrinsics: ``[3, 3]`` float64 given intrinsics, at the size of its camera; None if there are none.
-        container: the video that it is a frame of; None: no video.
+        container: the video or panorama that it is a part of; None: none.
         is_metric: whether its camera (and depth) is in metres.
         lens: lens that its file was undistorted from (``undistortion.lens_text``); empty for a pinhole image.
     """
@@ -122,7 +116,8 @@ def check_pictures(paths: Sequence[str]) -> None:
         ValueError: if there is no picture, or a file is not a picture.
     """
     found = [existing_path(path) for path in paths]
-    files = [path for path in found if path.is_file() and path.suffix.lower() not in VIDEO_SUFFIXES]
+    others = [path for path in found if path.suffix.lower() in VIDEO_SUFFIXES or is_camera_file(path)]
+    files = [path for path in found if path.is_file() and path not in others]
     if len(files) == len(found) and all(map(is_damaged, files)):
         find_pictures(files)
     for path in found:
@@ -132,6 +127,20 @@ def check_pictures(paths: Sequence[str]) -> None:
             _allow_heic(path)
         elif not any(file.suffix.lower() in _HOLDS_PICTURES for file in path.rglob("*")):
             image_files(path)
+
+
+def count_pictures(paths: Sequence[str], max_images: int | None = None) -> int:
+    """Returns about how many pictures files and folders give, without reading any; an archive counts as one."""
+    count = 0
+    for path in map(existing_path, paths):
+        if path.is_dir():
+            try:
+                count += len(image_files(path))
+            except ValueError:  # a recording of another layout
+                continue
+        else:
+            count += VIDEO_FRAMES if path.suffix.lower() in VIDEO_SUFFIXES else 1
+    return count if max_images is None else min(count, max_images)
 
 
 def as_items(images: ImagesLike) -> list[Any]:
@@ -207,6 +216,8 @@ def _pictures(item: Any, max_images: int | None, faults: dict[str, str]) -> list
         files = image_files(path)
         name_passed_over(path)
         return _photos(files, faults)
+    if is_camera_file(path):
+        raise ValueError(f"{path} is a file of cameras, which are not used here: give the folder of its images")
     if is_archive(path):
         files = recorded_files(path, ".jpg")
         if not files:
@@ -218,13 +229,22 @@ def _pictures(item: Any, max_images: int | None, faults: dict[str, str]) -> list
 
 
 def _photos(files: Sequence[Path], faults: dict[str, str]) -> list[Picture]:
-    found = []
+    """Returns photographs, panoramas as the faces of a cube; what is wrong with others is added to ``faults``."""
+    photos: dict[Path, Picture] = {}
     for file in files:
         try:
-            found.append(_photo(file))
+            photos[file] = _photo(file)
         except DataError as error:
             faults[str(file)] = reason_of(error)
-    return found
+    panoramas = find_panoramas([(file, photo.size) for file, photo in photos.items()])
+    if panoramas:
+        first = next(iter(panoramas)).name
+        log.warning("%d images are 360 degree panoramas, cut into cube faces: %s, ...", len(panoramas), first)
+    return [
+        picture
+        for file, photo in photos.items()
+        for picture in (_faces(photo, file, panoramas[file]) if file in panoramas else [photo])
+    ]
 
 
 def reason_of(error: DataError) -> str:
@@ -264,6 +284,20 @@ def _allow_heic(path: Path) -> None:
     register_heif_opener()
 
 
+def _faces(photo: Picture, path: Path, panorama: Panorama) -> list[Picture]:
+    """Returns the faces of a panorama; they have no file of their own."""
+
+    def face(name: str) -> Picture:
+        def read(size: tuple[int, int]) -> Frames:
+            pixels = panorama.cut(whole_pixels(path, path.stat().st_mtime_ns), name)
+            return frame_of(shrunk(pixels, size), panorama.cut_mask(mask_for(path), name))
+
+        side = panorama.side
+        return Picture(f"{photo.name}-{name}", (side, side), read, focal=side / 2, container=path)
+
+    return [face(name) for name in panorama.faces()]
+
+
 def _photo(path: Path, content_of: Callable[[Path], bytes | None] = lambda _: None) -> Picture:
     """Returns a photograph; ``content_of`` reads files inside an archive."""
     _allow_heic(path)
@@ -277,10 +311,6 @@ def _photo(path: Path, content_of: Callable[[Path], bytes | None] = lambda _: No
     size = image_size(path, "", upright=True, content=content)
     if content is not None:
         return Picture(path.stem, size, read)
-    if is_panorama(path, size):
-        raise ValueError(
-            f"{path} is a 360 degree panorama, which no pinhole camera represents: convert it to cube faces"
-        )
     return Picture(path.stem, size, read, focal=focal_length(path, size), path=path)
 
 

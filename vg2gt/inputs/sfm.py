@@ -28,12 +28,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image
-from scipy.cluster.vq import kmeans2, vq
 
 from vg2gt.data.sources.colmap_model import COLMAP, model_folder_of
 from vg2gt.data.sources.masks import mask_beside
 from vg2gt.data.transforms import reduce_to_fit, to_bytes
-from vg2gt.inputs.given_cameras import LAYOUTS, recording_pictures
+from vg2gt.inputs.folds import Matches, unfold
+from vg2gt.inputs.given_cameras import LAYOUTS, SFM_STATE, recording_pictures
+from vg2gt.inputs.likely_pairs import likely_pairs
+from vg2gt.inputs.motion import check_motion, why_not_placed
 from vg2gt.inputs.pictures import SFM_SOURCE, UNKNOWN_LENS, Picture, digest
 from vg2gt.io.colmap import EXTRA, quiet_colmap
 from vg2gt.io.errors import FormatError
@@ -52,17 +54,13 @@ LARGE_SIDE = 1200  # features of images from this longer side on are searched wi
 FEATURE_SIDE, FEATURES = 1280, 4096  # longer side of doubled images before doubling, maximum number of features
 MANY_SIDE, MANY_FEATURES = 1024, 2048  # the same for more than ALL_PAIRS photographs
 ALL_PAIRS = 60  # number of photographs up to which all pairs are matched
-DISTANCES = (1, 2, 4, 8, 16)  # to the paired photographs in the given order
-ALIKE = 10  # similar photographs per photograph
-APART = 3  # they are more than this far apart in the order: frames of a video would all be neighbours
-WORDS, ROUNDS, SAMPLE = 64, 10, 20_000  # clusters, iterations and sampled features of k-means
 SEED = 0
 _MODEL = "SIMPLE_RADIAL"
 _QUALITY = 95  # JPEG quality of the kept images
 FEWEST_POINTS = 20  # minimum number of points of a sound model: a camera that only rotates yields none
 _AT_ONCE = 4  # images per batch of feature extraction, to bound memory
 _PAIRS_AT_ONCE = 256  # pairs per call of the matcher, which indexes the features of every image in each call
-_STATE = "sfm.json"
+_LARGE_ERROR = 1.1  # pixels, mean reprojection error of photographs that a lens model does not fit
 _MASKS = "masks"
 
 _OTHERWISE = f"or put camera files next to them ({LAYOUTS}), or use a backend that needs no cameras, such as da3_small"
@@ -105,7 +103,7 @@ def find_cameras(pictures: Sequence[Picture], folder: Path, monitor: Monitor) ->
     state = _read_state(folder, key)
     if state is None:
         require_pycolmap()
-        if folder.exists() and any(folder.iterdir()) and not (folder / _STATE).is_file():
+        if folder.exists() and any(folder.iterdir()) and not (folder / SFM_STATE).is_file():
             raise FileExistsError(f"{folder} already exists and contains other files; move it or choose another --out")
         if len(pictures) < 2:
             raise ValueError(f"a single image is not enough to estimate depth or cameras: {ADVICE}")
@@ -120,6 +118,20 @@ def find_cameras(pictures: Sequence[Picture], folder: Path, monitor: Monitor) ->
             "%d of them form a separate part with no overlap with the %d images used; take photographs in between, or "
             "reconstruct that part separately: %s",
             len(part), len(state["images"]), ", ".join(part),
+        )  # fmt: skip
+    if undecided := state.get("undecided"):
+        log.warning(
+            "%d of the %d images used fit at two places: sides of the scene look alike, and nothing around them tells "
+            "them apart, so parts of the scene may lie on top of each other. Check the cameras; photograph it again on "
+            "a ground with texture, such as a newspaper, or mark one side: %s",
+            len(undecided), len(state["images"]), ", ".join(undecided[:10]),
+        )  # fmt: skip
+    wide = [picture.name for picture in pictures if picture.size[1] == 2 * picture.size[0]]
+    badly = state.get("error", 0) > _LARGE_ERROR or len(state["left_out"]) > len(pictures) / 4
+    if badly and 2 * len(wide) > len(pictures):
+        log.warning(
+            "%d images are twice as wide as high and fit badly as photographs: if they are changed 360 degree "
+            "panoramas, give the complete ones, or convert them to cube faces: %s, ...", len(wide), wide[0],
         )  # fmt: skip
     names = state["images"]
     source = f"{SFM_SOURCE}, {len(names)} of {len(pictures)} images"
@@ -143,7 +155,7 @@ def _key(pictures: Sequence[Picture]) -> str:
 def _read_state(folder: Path, key: str) -> dict[str, Any] | None:
     """Reads the state of a result folder; None if it is missing, damaged, incomplete, or of other pictures."""
     try:
-        state = read_json(folder / _STATE)
+        state = read_json(folder / SFM_STATE)
         same = state["key"] == key and all((folder / "images" / name).is_file() for name in state["images"])
     except (FormatError, OSError, KeyError, TypeError):
         return None
@@ -158,12 +170,14 @@ def _solve(pictures: Sequence[Picture], folder: Path, key: str, monitor: Monitor
         names = sorted(name for members in lenses.values() for name in members)
         _find_features(work, lenses, names, monitor)
         _match(work, names, monitor)
+        matches = Matches.read(work / "database.db")
+        check_motion(matches, {name: (key[1], key[0]) for key, members in lenses.items() for name in members})
         models = _map(work, len(names), monitor)
         if not models:
             raise ValueError(
-                f"cannot find the cameras of these {len(pictures)} images: too few overlap, taken from nearby but "
-                f"different positions; {ADVICE}"
+                f"cannot find the cameras of these {len(pictures)} images: {why_not_placed(matches)}; {ADVICE}"
             )
+        models, undecided = unfold(work / "database.db", matches, models, lambda: _map(work, len(names), monitor))
         placed, *others = _parts(models)
         _write(models[0], work)
         titles = {name: picture.name for name, picture in zip(names, pictures, strict=True)}
@@ -172,13 +186,15 @@ def _solve(pictures: Sequence[Picture], folder: Path, key: str, monitor: Monitor
             "images": {name: title for name, title in titles.items() if name in placed},
             "left_out": [title for name, title in titles.items() if name not in placed],
             "other_parts": [[titles[name] for name in sorted(part)] for part in others if part],
+            "error": round(models[0].compute_mean_reprojection_error(), 2),
+            "undecided": [titles[name] for name in undecided],
         }
         with whole_folder(folder) as staged:
             for part in ("images", "sparse"):
                 shutil.move(work / "undistorted" / part, staged / part)
             if (work / _MASKS).exists():
                 shutil.move(work / "undistorted-masks" / "images", staged / "masks")
-            write_json(staged / _STATE, state)
+            write_json(staged / SFM_STATE, state)
     return state
 
 
@@ -306,7 +322,7 @@ def _map(work: Path, count: int, monitor: Monitor) -> list[Reconstruction]:
     options.num_threads = options.mapper.num_threads = 1  # fixed order of sums: reproducible cameras
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
     pycolmap.set_random_seed(SEED)
-    (work / "models").mkdir()
+    (work / "models").mkdir(exist_ok=True)
     expected = iter(range(count))
     with monitor.stage("place cameras", count) as advance:
         models = pycolmap.incremental_mapping(
@@ -355,49 +371,6 @@ def _write(model: Reconstruction, work: Path) -> None:
             pycolmap.undistort_images(
                 work / target, work / "model", work / source, jpeg_quality=_QUALITY, num_threads=_threads()
             )
-
-
-def likely_pairs(descriptors: Sequence[NDArray[np.uint8]]) -> list[tuple[int, int]]:
-    """Returns pairs (earlier, later) of photographs that probably show the same things, sorted by the later one.
-
-    Args:
-        descriptors: ``[n, 128]`` SIFT descriptors of each photograph, in order; ``n`` may be 0.
-    """
-    vectors = _vlad(descriptors)
-    likeness = vectors @ vectors.T
-    count = len(descriptors)
-    pairs = {(i - distance, i) for distance in DISTANCES for i in range(distance, count)}
-    for i in range(count):
-        taken = [i]
-        for j in np.argsort(-likeness[i], kind="stable").tolist():
-            if len(taken) > ALIKE:
-                break
-            if min(abs(j - k) for k in taken) > APART:
-                taken.append(j)
-                pairs.add((min(i, j), max(i, j)))
-    return sorted(pairs, key=lambda pair: pair[::-1])
-
-
-def _vlad(descriptors: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
-    """Returns a unit vector per photograph, ``[N, words * 128]``: summed residuals of features to their words."""
-    everything = np.concatenate([np.zeros((0, 128), np.uint8), *descriptors])
-    if not len(everything):
-        return np.zeros((len(descriptors), 1), np.float32)
-    chosen = np.random.default_rng(SEED).permutation(len(everything))[:SAMPLE]
-    sample = everything[chosen].astype(np.float32)
-    words, _ = kmeans2(sample, sample[:WORDS], ROUNDS, minit="matrix")
-    found = np.zeros((len(descriptors), *words.shape), np.float32)
-    for row, own in enumerate(descriptors):
-        features = own.astype(np.float32)
-        nearest, _ = vq(features, words)
-        np.add.at(found[row], nearest, features - words[nearest])
-    # Normalise the part of each word first, so that none dominates.
-    return _unit(_unit(found).reshape(len(found), -1))
-
-
-def _unit(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
-    length = np.sqrt((vectors**2).sum(-1, keepdims=True, dtype=np.float32))
-    return vectors / np.maximum(length, np.float32(1e-9))
 
 
 def _threads() -> int:

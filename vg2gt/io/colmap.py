@@ -113,15 +113,33 @@ def read_colmap(folder: str | Path) -> Reconstruction:
     return model
 
 
-def _restore_names(model: Reconstruction, file: Path) -> None:
-    """Sets the names of images from ``images.txt``; pycolmap's reader ends them at the first space."""
+def count_images(folder: Path) -> int:
+    """Returns the number of images of the model in a folder, without reading it; 0 if it is missing or damaged."""
+    file = colmap_files(folder).get("images")
+    if file is None:
+        return 0
+    if file.suffix == ".txt":
+        return sum(1 for _ in _image_lines(file))
+    with regular(file).open("rb") as opened:
+        head = opened.read(8)
+    return struct.unpack("<Q", head)[0] if len(head) == 8 else 0
+
+
+def _image_lines(file: Path) -> Iterator[str]:
+    """Yields the first of the two lines of every image in ``images.txt``."""
     lines = iter(file.read_text(errors="replace").split("\n"))
     for line in map(str.strip, lines):
         if line and not line.startswith("#"):
-            number, *_, name = line.split(maxsplit=9)
-            if int(number) in model.images:
-                model.images[int(number)].name = name
+            yield line
             next(lines, None)  # its points
+
+
+def _restore_names(model: Reconstruction, file: Path) -> None:
+    """Sets the names of images from ``images.txt``; pycolmap's reader ends them at the first space."""
+    for line in _image_lines(file):
+        number, *_, name = line.split(maxsplit=9)
+        if int(number) in model.images:
+            model.images[int(number)].name = name
 
 
 def write_colmap(folder: str | Path, model: Reconstruction) -> Path:

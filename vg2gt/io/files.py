@@ -53,7 +53,7 @@ def replacing(path: str | Path, durable: bool = False) -> Iterator[Path]:
 
 def temporary_name(path: Path) -> Path:
     """Returns a random name next to ``path``; process ids are not unique across containers."""
-    return path.with_name(f".{path.name}.{secrets.token_hex(8)}.tmp")
+    return path.with_name(f".{path.name[:50]}.{secrets.token_hex(8)}.tmp")  # a name can have 255 bytes
 
 
 def write_bytes(path: str | Path, content: bytes, durable: bool = False) -> Path:

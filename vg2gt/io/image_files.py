@@ -78,15 +78,6 @@ def focal_length(path: Path, size: Size) -> float | None:
     return film * math.hypot(*size) / _FILM_DIAGONAL if 4 <= film <= 2000 else None
 
 
-def is_panorama(path: Path, size: Size) -> bool:
-    """Whether an image of ``(height, width)`` is equirectangular: twice as wide as high, with XMP GPano metadata."""
-    if size[1] != 2 * size[0]:
-        return False
-    with path.open("rb") as file:
-        head = file.read(1 << 16)
-    return b"ProjectionType" in head and b"equirectangular" in head
-
-
 def typical_size(sizes: Iterable[Size]) -> Size:
     """Returns a common ``(height, width)`` for images of several sizes: the lower median of each."""
     heights, widths = zip(*sizes, strict=True)

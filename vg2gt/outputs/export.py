@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import os
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -50,6 +52,7 @@ class ExportedViews:
         folder.mkdir(parents=True)
         for name, picture, image in zip(self.names, self.pictures, scene.images, strict=True):
             path = folder / name
+            path.parent.mkdir(parents=True, exist_ok=True)
             if picture is not None:
                 file = None if picture.lens else picture.path
                 if file is not None and orientation(file, "") == 1 and image_size(file, "") == picture.size:
@@ -97,11 +100,24 @@ def exported_views(scene: Scene) -> ExportedViews:
         log.warning("photographs of a scene read from a folder are not known: images are exported at the working size")
     shown = [camera.photo or camera for camera in named]
     sizes = tuple((each.height, each.width) for each in shown)
-    names = [each.name for each in shown]
-    if len({name.lower() for name in names}) < len(names):  # photographs of several folders
+    names = _with_folders([each.name for each in shown], scene.pictures if named[0].photo else ())
+    if len({name.lower() for name in names}) < len(names):
         names = [f"{camera.name[:-4]}{Path(name).suffix}" for camera, name in zip(named, names, strict=True)]
     cameras = Cameras(poses[None], torch.from_numpy(np.stack([each.intrinsics for each in shown]))[None], sizes[0])
     return ExportedViews(cameras, sizes, tuple(names), scene.pictures if named[0].photo else (None,) * len(named))
+
+
+def _with_folders(names: list[str], pictures: Sequence[Picture]) -> list[str]:
+    """Returns the names with the folders of their files below the common one, if there are several."""
+    files = [None if picture is None or picture.path is None else picture.path.absolute() for picture in pictures]
+    folders = {file.parent for file in files if file is not None}
+    if len(folders) < 2:
+        return names
+    common = Path(os.path.commonpath(folders))
+    return [
+        name if file is None else (file.parent.relative_to(common) / name).as_posix()
+        for name, file in zip(names, files, strict=True)
+    ]
 
 
 def _fewer(owner: NDArray[np.int64], own: NDArray[np.bool_]) -> NDArray[np.int64]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
@@ -47,6 +48,7 @@ if TYPE_CHECKING:
 
 ROWS = 12  # maximum number of views in report.png
 MESH_PIXELS = 2.0  # edge of a mesh voxel, in pixels at the median depth
+LEAST_BYTES, PHOTO_BYTES = 500_000, 300_000  # written per image: Gaussians and maps, an exported photograph
 _MESH_DEPTHS = 10.0  # maximum depth of the mesh, in median depths
 
 AddView: TypeAlias = "Callable[[RenderedView], None]"
@@ -80,6 +82,29 @@ def check_folder(folder: str | Path, outputs: Sequence[str], overwrite: bool) ->
     if there and not overwrite:
         raise FileExistsError(f"{there[0]} already exists; choose another folder or add --overwrite")
     return folder
+
+
+def check_space(folder: str | Path, outputs: Sequence[str], images: int) -> None:
+    """Checks that the disk of an output folder, which need not exist, has room for what is surely written.
+
+    Args:
+        folder: output folder.
+        outputs: names from :data:`OUTPUTS`.
+        images: number of images.
+
+    Raises:
+        ValueError: if it has not.
+    """
+    folder = Path(folder).expanduser()
+    place = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    scenes, photos = ({"scene.ply", "views.npz"} & set(outputs), {"colmap", "nerfstudio"} & set(outputs))
+    needed = images * (LEAST_BYTES * bool(scenes) + PHOTO_BYTES * len(photos))
+    free = shutil.disk_usage(place).free
+    if free < needed:
+        raise ValueError(
+            f"the disk of {folder} has {free / 1e6:.0f} MB left, but at least {needed / 1e6:.0f} MB are needed for "
+            f"{images} images; delete something, or choose another folder"
+        )
 
 
 def write_outputs(
@@ -141,7 +166,7 @@ def scene_figures(scene: Scene) -> dict[str, Any]:
         **refinement_figures(scene),
         **trust_figures(scene),
         "cameras": scene.cameras_from or PREDICTED,
-        **({"frame": scene.frame.name} if scene.frame is not None else {}),
+        **({} if scene.frame is None else {"frame": scene.frame.name, "to_source": scene.frame.to_source.tolist()}),
     }
 
 

@@ -20,7 +20,7 @@ from vg2gt.data.sources.sparse_points import SparsePoints
 from vg2gt.data.sources.undistortion import posed_image, size_on_disk
 from vg2gt.io import colmap_images, colmap_pose, read_colmap
 from vg2gt.io.cameras_json import invert_pose
-from vg2gt.io.colmap import colmap_files
+from vg2gt.io.colmap import colmap_files, count_images
 from vg2gt.io.image_files import Size
 
 log = logging.getLogger(__name__)
@@ -79,10 +79,8 @@ class COLMAP(FileSource):
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
         """Reads the model and the sizes of its images."""
-        model_folder, *others = models_of(folder)
+        model_folder = largest_of(models_of(folder), f" of scene {scene}")
         where = f"{model_folder} of scene {scene}"
-        if others:
-            log.warning("%s is its largest COLMAP model; ignored: %s", where, ", ".join(map(str, others)))
         with errors_name(scene):
             records = colmap_images(read_colmap(model_folder))
             named = {i: named_file(folder / self.images, record.name, where) for i, record in enumerate(records)}
@@ -130,16 +128,28 @@ class COLMAP(FileSource):
 
 
 def models_of(folder: Path) -> list[Path]:
-    """Returns the models at the first location that has any; the one with the largest file of images comes first."""
+    """Returns the models at the first location that has any; the one with most images comes first."""
     for name in _MODELS:
         place = folder / name
         if not place.is_dir() or (name == "." and not _has_images(place)):
             continue
-        inside = sorted(path for path in place.iterdir() if path.name.isdigit()) if name != "." else []
-        found = [path for path in (*inside, place) if colmap_files(path)]
-        if found:
-            return sorted(found, key=lambda model: -colmap_files(model)["images"].stat().st_size)
+        if found := models_in(place, split=name != "."):
+            return found
     return []
+
+
+def models_in(place: Path, split: bool = True) -> list[Path]:
+    """Returns the models in a folder and, if ``split``, in its subfolders ``0``, ``1``, ...; most images first."""
+    inside = sorted(path for path in place.iterdir() if path.name.isdigit()) if split else []
+    found = [path for path in (*inside, place) if colmap_files(path)]
+    return sorted(found, key=lambda model: (-count_images(model), -colmap_files(model)["images"].stat().st_size))
+
+
+def largest_of(models: Sequence[Path], where: str = "") -> Path:
+    """Returns the first of the models; the others are named in a warning."""
+    if others := models[1:]:
+        log.warning("%s%s is its largest COLMAP model; ignored: %s", models[0], where, ", ".join(map(str, others)))
+    return models[0]
 
 
 def model_folder_of(folder: Path) -> Path | None:

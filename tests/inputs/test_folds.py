@@ -1,0 +1,115 @@
+"""Equal sides of an object, which structure from motion puts on top of each other; and cameras that did not move."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.inputs.match_database import SIZE, Dots, box, floor, orbit, write_database
+from vg2gt.inputs import sfm
+from vg2gt.inputs.folds import Matches, contradicted_images, unfold
+from vg2gt.inputs.motion import check_motion, why_not_placed
+from vg2gt.io.colmap import quiet_colmap
+from vg2gt.monitor import Monitor
+
+pytest.importorskip("pycolmap")
+COUNT = 16
+
+
+def solved(folder: Path, dots: Dots):
+    """Models with all matches, those without false ones, and the images that fit at two places."""
+    with quiet_colmap():
+        names = write_database(folder / "database.db", orbit(COUNT), dots)
+        (folder / "images").mkdir()
+        matches = Matches.read(folder / "database.db")
+        check_motion(matches, dict.fromkeys(names, SIZE[::-1]))
+
+        def again():
+            return sfm._map(folder, COUNT, Monitor())
+
+        folded = again()
+        return folded, *unfold(folder / "database.db", matches, folded, again), matches
+
+
+def largest_error(model) -> float:
+    """Of the turns between all pairs of images, in degrees; as many images as were photographed."""
+    placed = {image.name: image.cam_from_world().rotation.matrix() for image in model.images.values()}
+    assert len(placed) == COUNT
+    found, true = np.stack([placed[name] for name in sorted(placed)]), orbit(COUNT)[:, :3, :3]
+    apart = [np.einsum("aij,bkj->abik", turns, turns) for turns in (found, true)]
+    cosine = (np.einsum("abij,abij->ab", *apart) - 1) / 2
+    return float(np.degrees(np.arccos(cosine.clip(-1, 1))).max())
+
+
+def test_different_sides_are_left_alone(tmp_path: Path) -> None:
+    folded, models, undecided, _ = solved(tmp_path, box((1, 2, 3, 4)))
+    assert models is folded
+    assert undecided == []
+    assert largest_error(models[0]) < 2
+
+
+@pytest.mark.parametrize("sides", [(1, 2, 1, 2), pytest.param((1, 1, 1, 1), marks=pytest.mark.slow)])
+def test_equal_sides_are_told_apart_by_the_ground(tmp_path: Path, sides) -> None:
+    folded, models, undecided, _ = solved(tmp_path, box(sides).joined(floor()))
+    assert sides[1] == 1 or largest_error(folded[0]) > 80
+    assert largest_error(models[0]) < 2
+    assert undecided == []
+
+
+def test_equal_sides_before_nothing_are_said(tmp_path: Path) -> None:
+    _, models, undecided, matches = solved(tmp_path, box((1, 2, 1, 2)))
+    assert len(undecided) >= 4
+    assert undecided == contradicted_images(models, matches)
+
+
+def still(
+    count: int, static: int, moving: int, shift: float, seed: int = 0
+) -> tuple[Matches, dict[str, tuple[int, int]]]:
+    """Matches of images of 1600x1200: a ring of static features, and others in the middle that move between images."""
+    noise, names = np.random.default_rng(seed), [f"{number:06d}.jpg" for number in range(count)]
+    angle, radius = noise.uniform(0, 2 * np.pi, static), noise.uniform(450, 590, static)
+    fixed = np.stack([800 + radius * np.cos(angle), 600 + radius * np.sin(angle)], 1)
+    turning = noise.uniform([600, 400], [1000, 800], (moving, 2))
+    features = {
+        name: np.concatenate([fixed, turning + np.array([shift * number, 0])])
+        + noise.normal(0, 0.3, (static + moving, 2))
+        for number, name in enumerate(names)
+    }
+    rows = np.tile(np.arange(static + moving)[:, None], 2)
+    pairs = {(one, other): rows for number, other in enumerate(names) for one in names[:number]}
+    return Matches(features, pairs, dict(pairs)), dict.fromkeys(names, (1600, 1200))
+
+
+@pytest.mark.parametrize(
+    ("matches", "said"),
+    [
+        (still(6, 300, 200, 20), "background is in place in 15 of 15 pairs of images, while something turns.*Mask it"),
+        (still(6, 300, 0, 0), "the camera did not move: features stay within 1 %.*walk around"),
+        (still(6, 0, 300, 1.5), "the camera did not move: features stay within 1 %"),  # a burst
+        (still(2, 0, 300, 4), "the camera did not move: features stay within 1 %"),
+        (still(6, 0, 300, 60), None),
+        (still(6, 30, 300, 60), None),  # few still features, such as a mark of a drone's camera
+    ],
+    ids=["turntable", "tripod", "burst", "two", "moved", "marked"],
+)
+def test_a_camera_that_did_not_move_is_said(matches, said: str | None) -> None:
+    if said is None:
+        check_motion(*matches)
+    else:
+        with pytest.raises(ValueError, match=said):
+            check_motion(*matches)
+
+
+@pytest.mark.parametrize(
+    ("matches", "said"),
+    [
+        (
+            still(2, 0, 43, 60)[0],
+            "the two images have 43 features in common, about 100 are needed, so they overlap too",
+        ),
+        (still(3, 0, 430, 60)[0], "that match best have 430 features in common, enough, but the camera only turned"),
+        (Matches({"a": np.zeros((0, 2)), "b": np.zeros((0, 2))}, {}, {}), "the two images have no features in common"),
+    ],
+)
+def test_what_two_photographs_lack_is_said(matches: Matches, said: str) -> None:
+    assert said in why_not_placed(matches)

@@ -1,0 +1,106 @@
+"""Photographs with the cameras of other programs (:mod:`vg2gt.io.photogrammetry`), matched by name."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from vg2gt.data.base import DataError
+from vg2gt.data.sources.undistortion import is_pinhole, lens_text, undistortion_of
+from vg2gt.io.cameras_json import NamedCamera, Photo
+from vg2gt.io.colmap import colmap_intrinsics, require_pycolmap
+from vg2gt.io.errors import FormatError
+from vg2gt.io.image_files import image_size
+from vg2gt.io.photogrammetry import ForeignCamera, is_camera_file, read_photogrammetry
+
+_PLACES = (".", "bundle")  # subfolders with files of cameras
+
+
+def camera_files_in(folder: Path) -> list[Path]:
+    """Returns the files of cameras in a folder or its ``bundle/``."""
+    places = [folder / place for place in _PLACES if (folder / place).is_dir()]
+    return [file for place in places for file in sorted(place.iterdir()) if is_camera_file(file)]
+
+
+def matched(cameras: Sequence[ForeignCamera], files: Sequence[Path]) -> dict[Path, ForeignCamera]:
+    """Returns the cameras of image files: by as much of the path as tells them apart, then by name, then by stem."""
+    found: dict[Path, ForeignCamera] = {}
+    for parts in (3, 2, 1):
+        for with_suffix in (True, False):
+            known = _by_key(cameras, parts, with_suffix)
+            keys = {file: _key(file.as_posix(), parts, with_suffix) for file in files}
+            counts = Counter(keys.values())
+            for file, key in keys.items():
+                if file not in found and counts[key] == 1 and key in known:
+                    found[file] = known[key]
+    return {file: found[file] for file in files if file in found}
+
+
+def _by_key(cameras: Sequence[ForeignCamera], parts: int, with_suffix: bool) -> Mapping[str, ForeignCamera]:
+    keys = [_key(camera.name, parts, with_suffix) for camera in cameras]
+    counts = Counter(keys)
+    return {key: camera for key, camera in zip(keys, cameras, strict=True) if counts[key] == 1}
+
+
+def _key(name: str, parts: int, with_suffix: bool) -> str:
+    path = PurePosixPath(name.replace("\\", "/"))
+    short = path.name if with_suffix else path.stem if path.suffix else path.name
+    return "/".join([*path.parts[:-1], short][-parts:]).lower()
+
+
+def named_camera(camera: ForeignCamera, name: str, size: tuple[int, int]) -> NamedCamera:
+    """Returns a camera of an image of ``(height, width)`` as stored: that of its undistorted pinhole image.
+
+    Raises:
+        ValueError: if the distortion is implausible.
+    """
+    require_pycolmap("reading cameras of photogrammetry programs")
+    import pycolmap  # pyright: ignore[reportMissingImports]
+
+    height, width = camera.size or size
+    model, params = camera.lens((height, width))
+    lens = pycolmap.Camera(model=model, width=width, height=height, params=params)
+    if is_pinhole(lens):
+        return NamedCamera(name, width, height, colmap_intrinsics(lens), camera.world_to_camera)
+    text = lens_text(lens, size)
+    undistorted = undistortion_of(text)
+    photo = Photo(name, undistorted.size[1], undistorted.size[0], undistorted.intrinsics, text)
+    return NamedCamera(name, photo.width, photo.height, photo.intrinsics, camera.world_to_camera, photo)
+
+
+def foreign_cameras(path: Path, files: Sequence[Path]) -> list[tuple[Path, NamedCamera]]:
+    """Returns the image files that a file of cameras names, with their cameras.
+
+    Raises:
+        DataError: if it is damaged, or a camera does not fit its image.
+    """
+    try:
+        pairs = matched(read_photogrammetry(path), files).items()
+        return [(file, named_camera(camera, file.name, image_size(file, ""))) for file, camera in pairs]
+    except DataError:
+        raise
+    except ValueError as error:
+        raise DataError(f"{path}: {error}") from error
+
+
+def cameras_to_render(path: Path, files: Sequence[Path]) -> list[NamedCamera]:
+    """Returns all cameras of a file; those of unknown size have that of their image.
+
+    Raises:
+        FormatError: if the file is damaged, or a size is not known.
+    """
+    cameras = read_photogrammetry(path)
+    images = {id(camera): file for file, camera in matched(cameras, files).items()}
+    found = []
+    for camera in cameras:
+        size = camera.size or (image_size(images[id(camera)], "") if id(camera) in images else None)
+        if size is None:
+            raise FormatError(f"{path} does not tell the size of {camera.name}: put its images next to it")
+        named = named_camera(camera, camera.name or "view", size)
+        found.append(
+            NamedCamera(named.name, named.width, named.height, np.array(named.intrinsics), named.world_to_camera)
+        )
+    return found
