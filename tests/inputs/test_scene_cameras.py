@@ -98,7 +98,7 @@ def test_cameras_found_are_turned_upright_with_the_scene(folder: Path, frames, m
     tilt = torch.eye(4)[None].double()
     tilt[:, :3, :3] = torch.linalg.matrix_exp(torch.tensor([[0.0, -0.7, 0.3], [0.7, 0, 0.9], [-0.3, -0.9, 0]]).double())
     put_colmap(folder, replace(frames, world_to_camera=(frames.world_to_camera.double() @ tilt).float()))
-    monkeypatch.setattr("vg2gt.reconstruction.pipeline.SFM_SOURCE", "COLMAP")
+    monkeypatch.setattr("vg2gt.inputs.camera_source.SFM_SOURCE", "COLMAP")
     scene = reconstruct_with(model, folder)
     scene.save(tmp_path, FILES[:3])
     assert scene.frame.name == "upright"
