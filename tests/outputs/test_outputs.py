@@ -17,6 +17,7 @@ from vg2gt.outputs.output_names import OUTPUTS
 from vg2gt.outputs.outputs import write_outputs
 from vg2gt.reconstruction.pipeline import reconstruct_with
 from vg2gt.reconstruction.scene import Scene
+from vg2gt.types import Cameras
 
 
 @pytest.fixture(scope="module")
@@ -124,23 +125,23 @@ def test_nothing_is_replaced_unasked(written: Path, scene: Scene, tmp_path: Path
     assert not (tmp_path / "color" / "stale.png").exists()
 
 
-def test_names_of_244_characters_and_folders_of_cameras_are_kept(folder: Path, model, tmp_path: Path) -> None:
+def test_names_of_244_characters_and_folders_of_cameras_are_kept(folder: Path, frames, model, tmp_path: Path) -> None:
     """As COLMAP allows: files of equal names in the folder of each camera, and names as long as a disk allows."""
-    long = "n" * 240 + ".png"
-    for number, name in enumerate(("front/1.png", "back/1.png", f"back/{long}")):
-        (tmp_path / "rig" / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(folder / "images" / f"{8 + number:03d}.png", tmp_path / "rig" / name)
-    scene = reconstruct_with(model, [tmp_path / "rig" / name for name in ("front/1.png", "back/1.png", f"back/{long}")])
-    scene.save(tmp_path / "out", ["colmap", "nerfstudio", "color.png"])
-    names = {"front/1.png", "back/1.png", f"back/{long}"}
+    names, rig = ["back/1.png", f"back/{'n' * 240}.png", "front/1.png"], tmp_path / "rig"
+    for number, name in enumerate(names):
+        (rig / "images" / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(folder / "images" / f"{8 + number:03d}.png", rig / "images" / name)
+    cameras = Cameras(frames.world_to_camera[None, :3].double(), frames.intrinsics[None, :3].double(), (84, 112))
+    io.write_colmap(rig / "sparse" / "0", io.colmap_from_views(cameras, names))
+    reconstruct_with(model, rig).save(tmp_path / "out", ["colmap", "nerfstudio", "color.png"])
     images = io.colmap_images(io.read_colmap(tmp_path / "out" / "colmap" / "sparse" / "0"))
-    assert {image.name for image in images} == names
+    assert [image.name for image in images] == names
     for name in names:
         for kind in ("colmap", "nerfstudio"):
-            assert (tmp_path / "out" / kind / "images" / name).read_bytes() == (tmp_path / "rig" / name).read_bytes()
-    frames = io.read_transforms(tmp_path / "out" / "nerfstudio" / "transforms.json").frames
-    assert {frame.file_path for frame in frames} == {f"images/{name}" for name in names}
-    assert (tmp_path / "out" / "color" / long).is_file()
+            assert (tmp_path / "out" / kind / "images" / name).read_bytes() == (rig / "images" / name).read_bytes()
+    written = io.read_transforms(tmp_path / "out" / "nerfstudio" / "transforms.json").frames
+    assert {frame.file_path for frame in written} == {f"images/{name}" for name in names}
+    assert (tmp_path / "out" / "color" / Path(names[1]).name).is_file()
 
 
 def test_a_full_disk_is_noticed_before_any_work(folder: Path, tmp_path: Path, monkeypatch) -> None:
