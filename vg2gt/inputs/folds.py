@@ -35,7 +35,7 @@ RIVAL = 0.2  # of an image's best matched pair, from which a contradicted pair c
 
 OUTVOTED = 2  # images that tell a pair apart, beyond twice those that do not, though it looks alike itself
 FEWEST_FALSE = 3  # pairs of different places, below which nothing is removed
-FEWEST_UNDECIDED = 0.1  # of the placed images
+FEWEST_UNDECIDED = 0.1  # of the placed images, and at least three of them
 ROUNDS = 3  # maximum number of times that the models are made anew
 
 
@@ -324,4 +324,5 @@ def unfold(
         matches = matches.without(found)
         models = again() or models
     undecided = contradicted_images(models, matches)
-    return models, undecided if len(undecided) >= FEWEST_UNDECIDED * len(models[0].images) else []
+    enough = max(3, FEWEST_UNDECIDED * len(models[0].images))
+    return models, undecided if len(undecided) >= enough else []
