@@ -77,8 +77,9 @@ class Training:
         if self.options.token_noise and self.step % 2:
             noise = torch.Generator().manual_seed(self.step)
             taps = tuple(tap + self.options.token_noise * torch.randn(tap.shape, generator=noise) for tap in taps)
-        decoded = self.net.decode(taps, encoding.context, encoding.context_fine, encoding.swept, encoding.origin)
-        loss, terms = objective(encoding, *decoded, sample)
+        state = (encoding.context, encoding.context_fine, encoding.swept, encoding.origin)
+        depth, log_scale = self.net.decode(taps, *state)
+        loss, terms = objective(encoding, depth, log_scale, sample)
         if not torch.isfinite(loss):
             raise RuntimeError(f"the objective is {float(loss)} at step {self.step}: {terms}")
         self.optimizer.zero_grad(set_to_none=True)

@@ -12,7 +12,7 @@ from backends.cascade.sweep import Stage
 from recipes.cascade.samples import Sample
 from recipes.sweep.objective import cell_inverse
 
-_CLAMP = 2.0  # log-depth errors are clamped to this
+_CLAMP, _SLOPE = 2.0, 0.2  # log-depth errors above this count by the slope only
 _BEYOND = 1.5 / (PLANES - 1)  # position from which on any greater depth counts as correct, as for sky
 _ROOM = 1.0  # up to this much log-depth farther, so that depth does not diverge
 _BEYOND_ERROR = 0.7  # minimum relative error that the uncertainty of such pixels is trained on
@@ -50,7 +50,7 @@ def objective(
     valid = known * ~beyond
     log_scale = log_scale.clamp(-6, 1)
     terms = {
-        "depth": _mean(error.abs().clamp_max(_CLAMP), known * sample.weight),
+        "depth": _mean(_limited(error), known * sample.weight),
         "uncertainty": _mean(stated * torch.exp(-log_scale) + log_scale, known),
         "gradient": sum((_gradient(error[:, ::k, ::k], valid[:, ::k, ::k]) for k in (1, 2, 4)), torch.zeros(())),
     }
@@ -63,7 +63,7 @@ def objective(
         sums["planes"].append(_cross_entropy(stage, planes.position(truth.log()), seen))
         looked = {"stages": found, "centers": center} | ({"guess": encoding.guess} if cell == 8 else {})
         for name, log_depth in looked.items():
-            off = _log_error(log_depth, truth, farthest)[0].abs().clamp_max(_CLAMP)
+            off = _limited(_log_error(log_depth, truth, farthest)[0])
             sums[name].append(_mean(off, seen if name == "stages" else weight))
     terms |= {name: torch.stack(values).sum() for name, values in sums.items()}
     return torch.stack([WEIGHTS[name] * term for name, term in terms.items()]).sum(), terms
@@ -76,6 +76,11 @@ def _log_error(log_depth: Tensor, truth: Tensor, farthest: Tensor) -> tuple[Tens
     error = log_depth - truth.log()
     outside = error.clamp_max(0) + (error - _ROOM).clamp_min(0)
     return torch.where(beyond, outside, error), beyond
+
+
+def _limited(error: Tensor) -> Tensor:
+    """Absolute error, less of what is gross; never flat, as planes reach to infinity."""
+    return error.abs().clamp_max(_CLAMP) + _SLOPE * (error.abs() - _CLAMP).clamp_min(0)
 
 
 def _mean(values: Tensor, weights: Tensor) -> Tensor:

@@ -88,6 +88,9 @@ def test_the_objective_is_lowest_at_the_truth(slope) -> None:
     assert worse("depth", decoded=1.1 * sample.depth)
     assert not worse("gradient", decoded=1.1 * sample.depth)  # the shape is right
     assert worse("guess", found._replace(guess=found.guess + 0.1))
+    # gross errors still pull: surfaces that were taken for sky must come back
+    gross = [objective(found, sample.depth * factor, unsure, sample)[1]["depth"] for factor in (30, 300)]
+    assert gross[1] > gross[0] + 0.3
     for level in range(3):
         centers, stages = list(found.centers), list(found.stages)
         centers[level] = centers[level] + 0.1
