@@ -109,7 +109,7 @@ def test_a_gpus_allocator_grows_its_segments(tmp_path: Path, own: str | None, mo
 @pytest.mark.parametrize("name", group_options("refine"))
 def test_refinements_instantiate_and_the_default_is_the_codes(name: str) -> None:
     config = compose(None, f"+refine={name}").refine
-    assert assert_signatures_fit(OmegaConf.to_container(config)) == 3
+    assert assert_signatures_fit(OmegaConf.to_container(config)) == 3 + (config.full is not None)
     assert (instantiate(config) == RefineOptions()) == (name == "default")
 
 

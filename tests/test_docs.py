@@ -102,7 +102,7 @@ def test_commands_and_their_options_exist(page: Path) -> None:
             assert flags <= set(re.findall(r"--[\w-]+", help_of(*command))), line
             composes(
                 "evaluate" if command[-1] == "views" else "train",
-                [f"+{o}" if program == "refine" else o for o in overrides],
+                [f"+{o}" if o.startswith(("refine.", "refine=")) else o for o in overrides],
                 line,
             )
 
