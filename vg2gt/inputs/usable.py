@@ -69,7 +69,8 @@ class _Borders:
         if self.count < _FEWEST or not _BORDERS[0] <= black.mean() <= _BORDERS[1]:
             return None
         near: NDArray[np.bool_] = np.asarray(ndimage.binary_dilation(black, np.ones((3, 3)), iterations=_MARGIN), bool)
-        ring = np.asarray(ndimage.binary_dilation(near, np.ones((3, 3)), iterations=_EDGE)) & ~near
+        around: NDArray[np.bool_] = np.asarray(ndimage.binary_dilation(near, np.ones((3, 3)), iterations=_EDGE), bool)
+        ring = around & ~near
         often = self.lit[ring] >= _OFTEN * self.count
         return (~near).astype(np.float32) if len(often) and often.mean() >= _OFTEN else None
 
