@@ -26,7 +26,7 @@ WINDOW = (
 
 QUALITY = (
     "how long to refine photographs: draft stays at the working size, normal and high continue at the photographs' own "
-    "size, high in four times as many steps"
+    "size, high in five times as many steps"
 )
 
 REFINE = "refine for N steps at the working size only, recordings too; 0: feed-forward"

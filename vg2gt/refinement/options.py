@@ -189,7 +189,7 @@ class FullSizeOptions:
     """
 
     size: int = 1600
-    steps: int = 1500
+    steps: int = 800
     renderings: float = 40.0
     crop: int = 320
     coarse: float = 0.5
