@@ -20,7 +20,7 @@ log = logging.getLogger(__name__)
 
 HEIC_SUFFIXES = (".heic", ".heif")
 PHOTO_SUFFIXES = (*IMAGE_SUFFIXES, *HEIC_SUFFIXES, ".avif", ".jfif", ".jpe")
-# Images that are not read as photographs, and those that cameras store beside or instead of them.
+# Images that are not read as photographs, and those that cameras store in addition to or instead of them.
 _OTHER_SUFFIXES = (
     *(".arw", ".cr2", ".cr3", ".dng", ".exr", ".gif", ".hdr", ".insp", ".jp2", ".j2k", ".jxl", ".nef", ".orf", ".pef"),
     *(".psd", ".raf", ".raw", ".rw2", ".srw", ".svg", ".tga", ".insv", ".lrv", R3D, *VIDEO_SUFFIXES),

@@ -36,7 +36,7 @@ RIVAL = 0.2  # of an image's best matched pair, from which a contradicted pair c
 OUTVOTED = 2  # images that tell a pair apart, beyond twice those that do not, though it looks alike itself
 FEWEST_FALSE = 3  # pairs of different places, below which nothing is removed
 FEWEST_UNDECIDED = 0.1  # of the placed images, and at least three of them
-ROUNDS = 3  # maximum number of times that the models are made anew
+ROUNDS = 3  # maximum number of times that the models are made again
 
 
 @dataclass(frozen=True)
@@ -314,7 +314,7 @@ def unfold(
         database: COLMAP's database; false matches are removed from it.
         matches: its matches.
         models: models made with all matches.
-        again: makes the models anew.
+        again: makes the models again.
     """
     for number in range(ROUNDS):
         found = false_pairs(models, matches, FEWEST_FALSE if number == 0 else 1)

@@ -58,7 +58,7 @@ def to_depth(t: Tensor, depth_range: Tensor) -> Tensor:
 
 
 class Residual(nn.Module):
-    """Two convolutions beside a shortcut; halves the size of the image if the widths differ."""
+    """Two convolutions and a shortcut; halves the size of the image if the widths differ."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()
