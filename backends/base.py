@@ -10,6 +10,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
+from vg2gt.geometry.cameras import relative_to_first
 from vg2gt.io.tensors import tensors_digest
 from vg2gt.types import Cameras, Geometry, Hints, Tokens
 
@@ -170,6 +171,29 @@ class Backend(nn.Module, ABC):
                 place = f"hints.cameras of scene {scene}, view {view}"
                 raise ValueError(f"{place} are not finite or have no positive focal length: leave the view out")
         return hints
+
+    def require_parallax(self, images: Tensor, hints: Hints | None) -> tuple[Hints, Cameras]:
+        """Returns hints with cameras that see the scenes of ``images`` from several positions.
+
+        Returns:
+            The hints, and their cameras relative to view 0 of each scene, in float32.
+
+        Raises:
+            ValueError: if :meth:`check_images` or :meth:`require_hints` fails, or a scene has a single view or all its
+                cameras are at the same position.
+        """
+        self.check_images(images)
+        hints = self.require_hints(images, hints, "cameras")
+        assert hints.cameras is not None
+        cameras = relative_to_first(hints.cameras.map(Tensor.double)).map(Tensor.float)
+        centers = torch.linalg.inv(cameras.world_to_camera)[..., :3, 3]
+        if (centers == centers[:, :1]).all(-1).all(-1).any():
+            raise ValueError(
+                f"backend {self.name} estimates depth from parallax, but got a single view, or all cameras are at the "
+                "same position: take photos from different positions, or choose a single-image backend "
+                "(backend=vggt_1b, backend=da3_small, ...)"
+            )
+        return hints, cameras
 
 
 @contextmanager

@@ -11,12 +11,10 @@ from torch import Tensor
 from backends.base import Backend
 from backends.cascade.network import CascadeNet
 from backends.cascade.planes import coarse_sources
-from backends.sweep.backend import CONFIDENCE, LICENCE, NO_PARALLAX
+from backends.sweep.backend import CONFIDENCE, LICENCE
 from backends.sweep.network import PosedViews
 from backends.sweep.tokens import DIM, PATCH, TAPS
-from backends.sweep.views import camera_distances
 from backends.weights import Weights
-from vg2gt.geometry.cameras import relative_to_first
 from vg2gt.geometry.precision import full_precision
 from vg2gt.types import Geometry, Hints, Tokens
 
@@ -56,16 +54,11 @@ class CascadeBackend(Backend):
         Raises:
             ValueError: also if the views have no parallax (one view, or all cameras at the same position).
         """
-        self.check_images(images)
-        hints = self.require_hints(images, hints, "cameras")
-        assert hints.cameras is not None
-        cameras = relative_to_first(hints.cameras.map(Tensor.double)).map(Tensor.float)
+        _, cameras = self.require_parallax(images, hints)
         encoded = []
         with full_precision(images):
             for scene, pictures in enumerate(images.float()):
                 views = PosedViews(pictures, cameras.world_to_camera[scene], cameras.intrinsics[scene])
-                if not (camera_distances(views.world_to_camera) > 0).any():
-                    raise ValueError(NO_PARALLAX)
                 sources = coarse_sources(views.world_to_camera, views.intrinsics, views.size)
                 encoded.append(self.network.encode(self.network.features(pictures), views, sources))
         taps = [torch.stack([each.taps[tap] for each in encoded]) for tap in range(TAPS)]

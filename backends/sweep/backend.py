@@ -12,19 +12,14 @@ from torch import Tensor
 from backends.base import Backend
 from backends.sweep.network import PosedViews, SweepNet
 from backends.sweep.tokens import DIM, PATCH, TAPS
-from backends.sweep.views import camera_distances, choose_sources
+from backends.sweep.views import choose_sources
 from backends.weights import Weights
-from vg2gt.geometry.cameras import relative_to_first
 from vg2gt.geometry.precision import full_precision
 from vg2gt.types import Geometry, Hints, Tokens
 
 SHIPPED = Path(__file__).parent / "weights" / "sweep.safetensors"
 LICENCE = "Apache-2.0"
 CONFIDENCE = (0.37, 400.0)  # bounds of 1 / expected relative error
-NO_PARALLAX = (
-    "backend sweep estimates depth from parallax, but got a single view, or all cameras are at the same position: take "
-    "photos from different positions, or choose a single-image backend (backend=vggt_1b, backend=da3_small, ...)"
-)
 
 
 class SweepBackend(Backend):
@@ -68,16 +63,11 @@ class SweepBackend(Backend):
         Raises:
             ValueError: also if the views have no parallax (one view, or all cameras at the same position).
         """
-        self.check_images(images)
-        hints = self.require_hints(images, hints, "cameras")
-        assert hints.cameras is not None
-        cameras = relative_to_first(hints.cameras.map(Tensor.double)).map(Tensor.float)
+        hints, cameras = self.require_parallax(images, hints)
         encoded = []
         with full_precision(images):
             for scene, pictures in enumerate(images.float()):
                 views = PosedViews(pictures, cameras.world_to_camera[scene], cameras.intrinsics[scene])
-                if not (camera_distances(views.world_to_camera) > 0).any():
-                    raise ValueError(NO_PARALLAX)
                 features = self.network.features(pictures)
                 hint = None if hints.depth_range is None else hints.depth_range[scene].float()
                 depth_range = self.network.find_range(features, views, self.sources, hint)

@@ -14,7 +14,7 @@ from backends.sweep.views import camera_distances, choose_sources
 from backends.weights import Weights
 from examples.backends.itermvs.matching import Projections
 from examples.backends.itermvs.network import HIDDEN, STRIDE, IterMVSNet
-from vg2gt.geometry.cameras import relative_to_first, resize_intrinsics
+from vg2gt.geometry.cameras import resize_intrinsics
 from vg2gt.geometry.precision import full_precision
 from vg2gt.types import Cameras, Geometry, Hints, Tokens
 
@@ -69,19 +69,11 @@ class IterMVSBackend(Backend):
         Raises:
             ValueError: also if the views have no parallax (one view, or all cameras at the same position).
         """
-        self.check_images(images)
-        hints = self.require_hints(images, hints, "cameras")
-        assert hints.cameras is not None
-        cameras = relative_to_first(hints.cameras.map(Tensor.double)).map(Tensor.float)
+        hints, cameras = self.require_parallax(images, hints)
         states, contexts, ranges = [], [], []
         with full_precision(images):
             for scene, pictures in enumerate(2 * images.float() - 1):
                 views = cameras.scene(scene)
-                if not (camera_distances(views.world_to_camera[0]) > 0).any():
-                    raise ValueError(
-                        "backend itermvs estimates depth from parallax, but got a single view, or all cameras are at "
-                        "the same position: take photos from different positions"
-                    )
                 given = hints.depth_range
                 ranges.append(self.find_range(pictures, views) if given is None else given[scene].float())
                 hidden, context = self._match(pictures, views, ranges[-1])
