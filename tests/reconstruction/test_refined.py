@@ -17,7 +17,7 @@ from vg2gt.inputs.inputs import load_views
 from vg2gt.inputs.pictures import find_pictures
 from vg2gt.io import read_cameras_json, read_gaussian_ply, write_cameras_json
 from vg2gt.monitor import Monitor
-from vg2gt.outputs.saved import near_of, read_scene
+from vg2gt.outputs.saved import read_scene, renderer_of
 from vg2gt.reconstruction.photographs import full_size, load_photographs
 from vg2gt.reconstruction.policy import refined_by_default, refinement_for
 from vg2gt.reconstruction.refined import _judged, refinement_lines
@@ -121,13 +121,15 @@ def test_what_is_hardly_usable_is_said_with_its_causes() -> None:
     assert "too far apart" in _judged(15.0, 1)
 
 
-def test_the_near_plane_is_that_of_the_scene(saved, tmp_path) -> None:
+def test_near_plane_and_opacities_are_those_of_the_scene(saved, tmp_path) -> None:
     folder = shutil.copytree(saved, tmp_path / "copy", ignore=shutil.ignore_patterns("refined"))
     assert read_scene(folder, Renderer(near=0.5), torch.device("cpu")).renderer.near == 0.5
     (folder / "report.json").write_text(json.dumps({"near": 0.002}))
     assert read_scene(folder, Renderer(), torch.device("cpu")).renderer.near == 0.002
+    (folder / "report.json").write_text(json.dumps({"near": 0.002, "antialiased": True}))
+    assert renderer_of(folder, Renderer(mode="rasterized")) == Renderer("rasterized", near=0.002, antialiased=True)
     (folder / "report.json").write_text("[]")  # of another program
-    assert near_of(folder, 0.5) == 0.5
+    assert renderer_of(folder, Renderer(near=0.5)) == Renderer(near=0.5)
 
 
 @pytest.mark.parametrize(

@@ -22,6 +22,7 @@ from vg2gt.refinement import sharpen as _sharpen
 from vg2gt.refinement.growth import contributions, footprints, in_front, remove_idle, split_large
 from vg2gt.refinement.parameters import Parameters
 from vg2gt.refinement.photographs import Crop, CropOrder
+from vg2gt.rendering import Renderer
 from vg2gt.types import Cameras
 
 FACTOR = 3
@@ -145,11 +146,13 @@ def test_detail_appears_that_the_working_size_does_not_show(
     assert len(found.scene.gaussians) > len(begin.gaussians)
     assert len(found.scores) > 1  # of the view that was left out
 
-    def psnr(scene: RefinedScene) -> float:
-        shown = start.renderer(scene.gaussians, photographs.cameras(scene.cameras)).color[0]
-        return float(-10 * (shown - photographs.images / 255).square().mean().log10())
+    def psnr(scene: RefinedScene, renderer: Renderer, truth: Photographs) -> float:
+        shown = renderer(scene.gaussians, truth.cameras(scene.cameras)).color[0]
+        return float(-10 * (shown - truth.images / 255).square().mean().log10())
 
-    assert psnr(found.scene) > psnr(begin) + 1.0
+    assert psnr(found.scene, found.renderer, photographs) > psnr(begin, start.renderer, photographs) + 1.0
+    small = photographs.halved().halved()  # right there only with compensated opacities
+    assert psnr(found.scene, found.renderer, small) > psnr(found.scene, start.renderer, small) + 1.0
     again = sharpen(begin, photographs, start.seen, start.renderer, options)
     assert torch.equal(again.scene.gaussians.means, found.scene.gaussians.means)
 

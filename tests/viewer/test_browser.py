@@ -67,11 +67,11 @@ def psnr(image: np.ndarray, truth: torch.Tensor) -> float:
     return -10 * math.log10(float(error.square().mean()))
 
 
-def compare(page: Any, path: Path, gaussians: Gaussians, cameras: Cameras) -> list[float]:
+def compare(page: Any, path: Path, gaussians: Gaussians, cameras: Cameras, antialiased: bool = False) -> list[float]:
     """PSNR of every view."""
     records = named_cameras(cameras, [str(index) for index in range(cameras.intrinsics.shape[1])])
-    show(page, path, ViewerScene(gaussians, records), cameras.size)
-    truth = render(gaussians, cameras, "rasterized", geometry=False).color[0]
+    show(page, path, ViewerScene(gaussians, records, antialiased=antialiased), cameras.size)
+    truth = render(gaussians, cameras, "rasterized", geometry=False, antialiased=antialiased).color[0]
     figures = []
     for index in range(len(records)):
         page.evaluate(f"vg2gtViewer.setCamera({index}).then(() => null)")
@@ -89,6 +89,15 @@ def test_screenshot_is_our_rasterized_image_of_a_room(page, tmp_path, size, coun
     megabytes = path.stat().st_size / 1e6
     print(f"{len(gaussians)} Gaussians, {megabytes:.2f} MB, loaded in {seconds:.2f} s, PSNR {figures}")
     assert min(figures) > CLOSE
+
+
+def test_opacities_are_compensated_where_the_scene_says_so(page, tmp_path, benchmark_script):
+    room = benchmark_script("render")
+    size = (240, 320)
+    gaussians, cameras = room.room_gaussians(25_000, size, sigma=0.5), room.room_cameras(12, size).select(slice(0, 1))
+    plain, compensated = (render(gaussians, cameras, "rasterized", antialiased=on).color for on in (False, True))
+    assert (plain - compensated).abs().mean() > 0.01
+    assert min(compare(page, tmp_path / "room.html", gaussians, cameras, antialiased=True)) > CLOSE
 
 
 def test_controls_move_the_view_and_reset_brings_it_back(page: Any, tmp_path: Path) -> None:

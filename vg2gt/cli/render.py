@@ -65,7 +65,7 @@ def run(options: argparse.Namespace) -> None:
     from vg2gt.io.video import require_pyav
     from vg2gt.monitor import Monitor
     from vg2gt.outputs.outputs import animation, check_folder, check_outputs, cost_figures, feed, map_folder
-    from vg2gt.outputs.saved import near_of, scene_file
+    from vg2gt.outputs.saved import renderer_of, scene_file
     from vg2gt.reconstruction.scene import render_views
     from vg2gt.rendering import Renderer
     from vg2gt.runs.load import choose_device
@@ -87,8 +87,9 @@ def run(options: argparse.Namespace) -> None:
         raise ValueError(f"{scene} holds no Gaussians; there is nothing to render")
     if still is not None:
         still = cameras_of_scene(still[0], scene, gaussians), *still[1:]
-    near = near_of(scene.parent, Renderer().near) if options.near is None else options.near
-    renderer = Renderer(mode=options.mode, depth=options.depth, near=near)
+    renderer = renderer_of(scene.parent, Renderer(mode=options.mode, depth=options.depth))
+    if options.near is not None:
+        renderer = replace(renderer, near=options.near)
     cameras, fps, note = still or _moving(options, scene, gaussians, renderer)
     if not set(outputs) - COLORS:
         renderer = replace(renderer, geometry=False)

@@ -52,7 +52,7 @@ def run(arguments: argparse.Namespace) -> None:
     from vg2gt.inputs.camera_files import read_cameras
     from vg2gt.inputs.scene_cameras import cameras_of_scene
     from vg2gt.io import read_gaussians
-    from vg2gt.outputs.saved import near_of
+    from vg2gt.outputs.saved import renderer_of
     from vg2gt.rendering import Renderer
     from vg2gt.viewer import ViewerScene, scene_title, write_viewer_html
 
@@ -62,7 +62,8 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.color is not None:
         gaussians = _by_trust(arguments.scene, gaussians)
     title = arguments.title or scene_title(arguments.scene)
-    scene = ViewerScene(gaussians, title=title, near=near_of(arguments.scene.parent, Renderer().near))
+    renderer = renderer_of(arguments.scene.parent, Renderer())
+    scene = ViewerScene(gaussians, title=title, near=renderer.near, antialiased=renderer.antialiased)
     if arguments.cameras is not None:
         cameras = cameras_of_scene(read_cameras(arguments.cameras), arguments.scene, gaussians)
         folder = arguments.cameras.parent

@@ -163,6 +163,7 @@ def scene_figures(scene: Scene) -> dict[str, Any]:
         "metres_per_unit": scene.metres_per_unit,
         "mode": scene.renderer.mode,
         "near": scene.renderer.near,
+        "antialiased": scene.renderer.antialiased,
         **refinement_figures(scene),
         **trust_figures(scene),
         "cameras": scene.cameras_from or PREDICTED,
@@ -321,8 +322,11 @@ def _scene_ply(scene: Scene, path: Path) -> None:
 
 def _page(scene: Scene, path: Path) -> None:
     pictures = [thumbnail(to_pixels(image)) for image in scene.images]
-    cameras, near = scene.named_cameras(), scene.renderer.near
-    write_viewer_html(path, ViewerScene(scene.gaussians, cameras, pictures, scene_title(path), near))
+    cameras, options = scene.named_cameras(), scene.renderer
+    shown = ViewerScene(
+        scene.gaussians, cameras, pictures, scene_title(path), near=options.near, antialiased=options.antialiased
+    )
+    write_viewer_html(path, shown)
 
 
 def _points_ply(scene: Scene, path: Path) -> None:

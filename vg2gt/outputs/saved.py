@@ -58,7 +58,7 @@ def read_scene(folder: str | Path, renderer: Renderer, device: torch.device | st
         cameras=Cameras(poses.float()[None], intrinsics.float()[None], sizes[0]).to(device),
         **_read_views(folder / "views.npz", named, sizes[0]),
         names=tuple(view_stem(camera.name) for camera in named),
-        renderer=replace(renderer, near=near_of(folder, renderer.near)),
+        renderer=renderer_of(folder, renderer),
         metres_per_unit=report.get("metres_per_unit") if metres is None else metres,
         cameras_from="" if cameras_from == PREDICTED else cameras_from,
         frame=None if similarity is None else SceneFrame(frame, similarity, None, frame),
@@ -81,12 +81,15 @@ def scene_file(path: str | Path) -> Path:
     raise FileNotFoundError(f"{path} has no scene.ply or scene.spz: give a scene's file or a folder with one")
 
 
-def near_of(folder: Path, default: float) -> float:
-    """Returns the near plane of the scene in a folder, if its ``report.json`` has one, else the default."""
+def renderer_of(folder: Path, renderer: Renderer) -> Renderer:
+    """Returns a renderer with the near plane and antialiasing of the scene in a folder, if its report states them."""
     file = folder / "report.json"
     report = read_json(file) if file.is_file() else None
-    near = report.get("near") if isinstance(report, dict) else None
-    return near if isinstance(near, float) and near > 0 else default
+    known = report if isinstance(report, dict) else {}
+    near, antialiased = known.get("near"), known.get("antialiased")
+    if isinstance(near, float) and near > 0:
+        renderer = replace(renderer, near=near)
+    return replace(renderer, antialiased=antialiased) if isinstance(antialiased, bool) else renderer
 
 
 def _read_views(path: Path, named: list[NamedCamera], size: tuple[int, int]) -> dict[str, Any]:

@@ -57,7 +57,13 @@ def refine_scene(
         left = None if options.seconds is None else max(0.0, options.seconds - (clock() - began))
         with monitor.stage("refine at full size", 100, " %") as advance:
             refined = sharpened(refined, photographs, seen, scene.renderer, options, left, _shown(advance), clock)
-    made = replace(scene, gaussians=refined.scene.gaussians, cameras=refined.scene.cameras, refined=refined)
+    made = replace(
+        scene,
+        gaussians=refined.scene.gaussians,
+        cameras=refined.scene.cameras,
+        refined=refined,
+        renderer=scene.renderer if refined.sharpened is None else refined.sharpened.renderer,
+    )
     return without_debris(made)
 
 

@@ -78,7 +78,7 @@ def sharpened(
     scene = replace(sharp.scene, cameras=poses)
     if options.rates.cameras:
         scene = scene.seen_from(refined.scene.cameras.world_to_camera[0, 0])
-    _, after = view_losses(scene, seen, renderer, options.loss.with_geometry(0), torch.arange(len(seen.images)))
+    _, after = view_losses(scene, seen, sharp.renderer, options.loss.with_geometry(0), torch.arange(len(seen.images)))
     return replace(
         refined,
         scene=scene,

@@ -28,7 +28,8 @@ APART = 20  # minimum number of steps between two checks
 CHECKS = 8  # number of times that left-out views are scored
 PATIENCE = 3  # checks below the best one after which the stage ends
 NOTICED = 0.1  # dB
-HALVED = 2.5  # size of the photographs, in working sizes, from which the stage begins at half of it
+# size of the photographs, in working sizes, from which the stage begins at half of it and compensates opacities
+LARGE = 2.5
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,7 @@ class Sharpened:
         fold: left-out views.
         scores: PSNR of the left-out views in dB, before and while they were left out.
         growth: number of Gaussians that were split.
+        renderer: renderer that the scene was fitted with; scenes of large photographs are ``antialiased``.
     """
 
     scene: RefinedScene
@@ -51,6 +53,7 @@ class Sharpened:
     fold: tuple[int, ...]
     scores: tuple[float, ...]
     growth: int
+    renderer: Renderer
 
 
 def sharpen(
@@ -100,9 +103,12 @@ class _Sharpening:
     ) -> None:
         assert options.full is not None
         self.options, self.full, self.loss = options, options.full, options.loss
-        self.whole, self.seen, self.renderer = photographs, seen, renderer
-        large = max(photographs.size) >= HALVED * max(start.cameras.size)
+        large = max(photographs.size) >= LARGE * max(start.cameras.size)
+        self.whole, self.seen = photographs, seen
         self.photographs = photographs.halved() if large and self.full.coarse else photographs
+        # rendered smaller than it was fitted, a scene of small Gaussians is right only with compensated opacities;
+        # what was fitted at the working size is too small for them there, but not at much larger sizes
+        self.given, self.renderer = renderer, replace(renderer, antialiased=True) if large else renderer
         self.intrinsics = start.cameras.intrinsics[0]
         self.start = replace(start, cameras=self.photographs.cameras(start.cameras)).detach()
         self.clock, self.began, self.seconds = clock, clock(), seconds
@@ -135,7 +141,8 @@ class _Sharpening:
                     observe(self.steps, self._done(), sum(self.recent) / len(self.recent))
         except KeyboardInterrupt:
             ended = "interrupted"
-        scene = self.start if ended == "no gain" else self.parameters.scene().detach()
+        useless = ended == "no gain"
+        scene = self.start if useless else self.parameters.scene().detach()
         scene = replace(scene, cameras=self.whole.cameras(scene.cameras))
         return Sharpened(
             scene=scene,
@@ -144,6 +151,7 @@ class _Sharpening:
             fold=tuple(self.fold.tolist()),
             scores=tuple(self.scores),
             growth=self.growth,
+            renderer=self.given if useless else self.renderer,
         )
 
     def _raw(self) -> float:

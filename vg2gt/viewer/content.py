@@ -35,6 +35,7 @@ class ViewerScene:
         pictures: ``[H, W, 3]`` uint8 or None, one per camera; empty: no pictures.
         title: title of the page.
         near: near plane in scene units.
+        antialiased: whether opacities are compensated for the low-pass filter (:class:`RenderOptions`).
     """
 
     gaussians: Gaussians
@@ -42,6 +43,7 @@ class ViewerScene:
     pictures: Sequence[NDArray[np.uint8] | None] = ()
     title: str = "scene"
     near: float = RenderOptions.near
+    antialiased: bool = RenderOptions.antialiased
 
     def initial(self) -> NamedCamera:
         """Returns the initial view: the first camera, else :func:`default_camera`."""

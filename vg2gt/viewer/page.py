@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from vg2gt.io.files import write_text
 from vg2gt.io.gaussian_arrays import to_arrays
 from vg2gt.io.images import encode_image
-from vg2gt.rendering.constants import ALPHA_MIN, JACOBIAN_CLAMP
+from vg2gt.rendering.constants import ALPHA_MIN, COMPENSATION_FLOOR, JACOBIAN_CLAMP
 from vg2gt.rendering.options import RenderOptions
 from vg2gt.types import Gaussians
 from vg2gt.viewer.content import ViewerScene
@@ -112,6 +112,8 @@ def _content(scene: ViewerScene, header: dict[str, float]) -> dict[str, Any]:
             "near": scene.near,
             "background": [0.0, 0.0, 0.0] if behind is None else behind[0].tolist(),
             "lowpass": options.lowpass,
+            "antialiased": scene.antialiased,
+            "compensation_floor": COMPENSATION_FLOOR,
             "alpha_max": options.alpha_max,
             "alpha_min": ALPHA_MIN,
             "jacobian_clamp": JACOBIAN_CLAMP,

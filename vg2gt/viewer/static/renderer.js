@@ -158,6 +158,7 @@ class Renderer {
     gl.uniform2f(uniforms.slopeLimit, settings.jacobian_clamp * this.canvas.width / 2 / lens.fx,
       settings.jacobian_clamp * this.canvas.height / 2 / lens.fy);
     gl.uniform1f(uniforms.lowpass, settings.lowpass);
+    gl.uniform1f(uniforms.compensationFloor, settings.antialiased ? settings.compensation_floor : 1);
     gl.uniform1f(uniforms.alphaMin, settings.alpha_min);
     gl.uniform1f(uniforms.alphaMax, settings.alpha_max);
     gl.uniform1i(uniforms.degree, this.gaussians.degree);

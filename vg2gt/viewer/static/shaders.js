@@ -21,6 +21,7 @@ uniform vec4 lens;            // fx, fy, cx, cy
 uniform vec2 size;
 uniform vec2 slopeLimit;
 uniform float lowpass;
+uniform float compensationFloor;  // 1: opacities are not compensated for the low-pass filter
 uniform float alphaMin;
 in uint index;
 out vec2 vUnit;
@@ -70,9 +71,7 @@ vec3 colorSeen(int gaussian, vec3 d) {
 void main() {
   int gaussian = int(index);
   vec4 first = texel(geometry, 3 * gaussian);
-  float cutoff = 2.0 * log(first.w / alphaMin);
   gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
-  if (!(cutoff > 0.0)) return;
   vec3 mean = rotation * first.xyz + translation;
   vec2 tangent = mean.xy / mean.z;
   vec2 slope = clamp(tangent, -slopeLimit, slopeLimit);
@@ -87,6 +86,10 @@ void main() {
     xy += v.x * v.y;
     yy += v.y * v.y;
   }
+  float sharp = (xx - lowpass) * (yy - lowpass) - xy * xy, blurred = xx * yy - xy * xy;
+  float opacity = first.w * sqrt(max(sharp / blurred, compensationFloor));
+  float cutoff = 2.0 * log(opacity / alphaMin);
+  if (!(cutoff > 0.0)) return;
   float middle = 0.5 * (xx + yy), spread = length(vec2(0.5 * (xx - yy), xy));
   float larger = middle + spread, smaller = max(middle - spread, lowpass);
   vec2 major = xx > yy ? vec2(larger - yy, xy) : vec2(xy, larger - xx);
@@ -95,7 +98,7 @@ void main() {
   vUnit = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0 - 1.0;
   vec2 offset = sqrt(cutoff * larger) * vUnit.x * major + sqrt(cutoff * smaller) * vUnit.y * vec2(-major.y, major.x);
   vColor = colorSeen(gaussian, normalize(first.xyz - eye));
-  vOpacity = first.w;
+  vOpacity = opacity;
   vCutoff = cutoff;
   gl_Position = vec4(toClip(tangent * lens.xy + lens.zw + offset, size), 0.0, 1.0);
 }`;
