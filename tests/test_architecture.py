@@ -62,11 +62,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     }
     | BASICS,
 }
-# A scene saves itself, and images are added to a saved scene.
-UPWARDS = {
-    "vg2gt.reconstruction.scene -> vg2gt.outputs.outputs",
-    "vg2gt.reconstruction.pipeline -> vg2gt.outputs.saved",
-}
+UPWARDS = {"vg2gt.reconstruction.scene -> vg2gt.outputs.outputs"}  # a scene saves itself
 OF_BACKENDS = ("vg2gt.types", "vg2gt.geometry", "vg2gt.io.tensors", "vg2gt.io.files", "vg2gt.kernels.compiled")
 
 

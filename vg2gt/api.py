@@ -5,21 +5,23 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from vg2gt.inputs.cameras import Poses
 from vg2gt.inputs.pictures import ImagesLike
+from vg2gt.memory import RECONSTRUCTION, memory_advice, note_sizes
 from vg2gt.monitor import Monitor
 from vg2gt.outputs.output_names import SFM
 from vg2gt.reconstruction.pipeline import reconstruct_with
-from vg2gt.reconstruction.policy import Quality, Refinement
+from vg2gt.reconstruction.policy import Quality, Refinement, read_options
 from vg2gt.reconstruction.refined import refined_by_policy
 from vg2gt.reconstruction.scene import Scene
 from vg2gt.reconstruction.windows import WINDOWS
 from vg2gt.reconstruction.windows.run import device_of
 from vg2gt.runs.load import LoadedModel, load_model
 from vg2gt.runs.pretrained import weights_file
+from vg2gt.types import check_choice
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,7 @@ class Pipeline(LoadedModel):
             ValueError: if the images cannot be used, or an option is unknown.
             OutOfMemory: if the device's memory is full.
         """
+        check_refinement(refine, quality, overrides)
         kept = None if folder is None else Path(folder)
         with ExitStack() as stack:
             if monitor is None:
@@ -86,7 +89,33 @@ class Pipeline(LoadedModel):
                 keep_windows=keep_windows,
                 calibration=self.calibration,
             )
-            return refined_by_policy(scene, refine, quality, overrides, monitor)
+            return refined(scene, refine, quality, overrides, monitor)
+
+
+def refined(
+    scene: Scene, refine: Refinement, quality: Quality, overrides: Sequence[str], monitor: Monitor | None = None
+) -> Scene:
+    """Refines a scene unless it is to stay as it is (:func:`vg2gt.reconstruction.refined.refined_by_policy`).
+
+    Raises:
+        OutOfMemory: if the device's memory is full; the message says what takes less.
+    """
+    height, width = scene.cameras.size
+    with memory_advice(RECONSTRUCTION):
+        note_sizes({f"images of {height}x{width}": len(scene.names), "Gaussians": len(scene.gaussians)})
+        return refined_by_policy(scene, refine, quality, overrides, monitor)
+
+
+def check_refinement(refine: Refinement, quality: Quality, overrides: Sequence[str]) -> None:
+    """Checks the options of a refinement before any work is done; arguments as for :meth:`Pipeline.reconstruct`.
+
+    Raises:
+        ValueError: if a name or a value is unknown or out of range; the message names it.
+    """
+    check_choice("quality", quality, Quality)
+    options = read_options("photographs", overrides)
+    if isinstance(refine, int) and refine:
+        replace(options, steps=int(refine))  # checks the range
 
 
 def load(

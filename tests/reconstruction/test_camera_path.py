@@ -219,7 +219,6 @@ def test_mistakes_of_a_video(folder: Path) -> None:
         ((alone,), r"alone has no scene.ply or scene.spz"),
         ((alone / "ball.ply",), "alone has no cameras.json: choose the cameras with --cameras, --orbit or --path"),
         ((folder, "--seconds", "3"), "--seconds requires --orbit or --path"),
-        ((folder, "--orbit", "--seconds", "-1"), "must be positive"),
         ((folder, "--orbit", "--interpolate", "2"), "--interpolate is for views as they are"),
         ((folder, "--path", folder / "nerfstudio.json", "--seconds", "3"), "leave --seconds away"),
         ((folder, "--path", folder / "one.json"), "two different cameras, got 1"),
@@ -229,9 +228,10 @@ def test_mistakes_of_a_video(folder: Path) -> None:
     for arguments, said in cases:
         with pytest.raises(SystemExit, match=said):
             run(*arguments)
-    with pytest.raises(SystemExit) as ended:
-        run(folder, "--orbit", "--size", "1920")
-    assert ended.value.code == 2
+    for flag, value in (("--size", "1920"), ("--seconds", "-1"), ("--fps", "0")):
+        with pytest.raises(SystemExit) as ended:
+            run(folder, "--orbit", flag, value)
+        assert ended.value.code == 2
     assert not [file for file in folder.rglob("*") if file.suffix in (".mp4", ".tmp", ".png")]
 
 

@@ -173,6 +173,28 @@ def test_errors_are_stated_and_the_scene_is_refined_by_its_kind(recording: Path,
     assert asked == [replace(refinement_for(scene), steps=5), replace(normal, steps=50), RefineOptions(steps=50)]
 
 
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"quality": "best"}, "choose one of draft, normal, high"),
+        ({"refine": -3}, "refine.steps must be at least 1"),
+        ({"overrides": ["refine.full.crops=3"]}, "crops"),
+    ],
+)
+def test_wrong_options_of_a_refinement_end_before_any_work(
+    wrong: dict, said: str, recording: Path, monkeypatch
+) -> None:
+    monkeypatch.setattr("vg2gt.api.reconstruct_with", lambda *_, **__: pytest.fail("reconstructed"))
+    with pytest.raises(ValueError, match=said):
+        vg2gt.load(device="cpu").reconstruct(recording, **wrong)
+
+
+def test_full_memory_of_a_refinement_names_what_takes_less(scene: vg2gt.Scene, monkeypatch) -> None:
+    monkeypatch.setattr(refined, "refine_scene", lambda *_: torch.empty(1 << 60))
+    with pytest.raises(OutOfMemory, match=r"4 images of 84x112.*refine\.full\.size"):
+        vg2gt.api.refined(scene, True, "normal", ())
+
+
 @pytest.mark.parametrize("error", [torch.OutOfMemoryError("CUDA out of memory"), MemoryError("no more")])
 def test_full_memory_names_the_knobs(error: Exception, ready, recording: Path, monkeypatch) -> None:
     def fail(*args, **kwargs):

@@ -14,7 +14,9 @@ from vg2gt.cli import reconstruct as command
 from vg2gt.data import SyntheticScenes
 from vg2gt.io import read_cameras_json, read_gaussian_ply
 from vg2gt.monitor import Monitor
+from vg2gt.outputs.saved import read_scene
 from vg2gt.reconstruction.pipeline import add_images, take_out
+from vg2gt.reconstruction.scene import Scene
 from vg2gt.reconstruction.windows.run import gaussians_of
 from vg2gt.reconstruction.windows.store import finished_sets, read_anchor, tidy
 from vg2gt.rendering import Renderer
@@ -49,6 +51,11 @@ def fingerprint(gaussians) -> str:
     return hashlib.sha256(b"".join(value.contiguous().numpy().tobytes() for value in values)).hexdigest()
 
 
+def changed(change, model, scene: Path, part: Path) -> Scene:
+    """The scene in a folder with images added or taken out."""
+    return change(model, read_scene(scene, Renderer()), scene, part, Monitor(), 4)
+
+
 @pytest.mark.parametrize(("changes", "met_again"), [(10, 4), pytest.param(20, 10, marks=pytest.mark.slow)])
 def test_any_order_of_adding_and_taking_out_gives_the_same_scene(parts, model, tmp_path, changes, met_again) -> None:
     """Issue 49's bar, the slow case: 20 random orders, equal to the bit."""
@@ -61,7 +68,7 @@ def test_any_order_of_adding_and_taking_out_gives_the_same_scene(parts, model, t
     for _ in range(changes):
         part = rng.randrange(1, SETS)
         change = take_out if part in there else add_images
-        scene = change(model, tmp_path / "scene", parts[part], Renderer(), Monitor(), 4)
+        scene = changed(change, model, tmp_path / "scene", parts[part])
         scene.save(tmp_path / "next", ("scene.ply", "cameras.json", "views.npz"))
         for file in (tmp_path / "next").iterdir():
             shutil.move(file, tmp_path / "scene" / file.name)
@@ -96,18 +103,8 @@ def test_the_scene_without_them_is_the_scene_that_never_saw_them(parts, tmp_path
 def test_taking_out_can_be_repeated_until_the_scene_is_written(parts, tmp_path, monkeypatch) -> None:
     start(parts, tmp_path / "scene")
     before = (tmp_path / "scene" / "scene.ply").read_bytes()
-    rest = [
-        str(parts[1]),
-        "--quiet",
-        "--device",
-        "cpu",
-        "--window",
-        "4",
-        "--refine",
-        "0",
-        *BY_ITSELF,
-        "model.coarse=null",
-    ]
+    rest = [str(parts[1]), "--quiet", "--device", "cpu", "--window", "4", "--refine", "0", *BY_ITSELF]
+    rest.append("model.coarse=null")
     command.main(["--add", str(tmp_path / "scene"), *rest])
     with pytest.raises(SystemExit, match="--size, --drop cannot be combined with --add or --take-out"):
         command.main(["--take-out", str(tmp_path / "scene"), "--drop", "guessed", "--size", "56", *rest])
@@ -128,17 +125,17 @@ def full(*_, **__) -> None:
 
 def test_what_cannot_be_changed_says_why(parts, model, tmp_path) -> None:
     start(parts, tmp_path / "scene")
-    here = (Renderer(), Monitor(), 4)
+    here = tmp_path / "scene"
     with pytest.raises(ValueError, match="already has images with these names: 000"):
-        add_images(model, tmp_path / "scene", parts[0], *here)
+        changed(add_images, model, here, parts[0])
     with pytest.raises(ValueError, match="not added by one command"):
-        take_out(model, tmp_path / "scene", parts[1], *here)
+        changed(take_out, model, here, parts[1])
     with pytest.raises(ValueError, match="another model"):
-        add_images(built("plain"), tmp_path / "scene", parts[1], *here)
-    anchor = tmp_path / "scene" / "windows" / "scene.json"
+        changed(add_images, built("plain"), here, parts[1])
+    anchor = here / "windows" / "scene.json"
     anchor.write_text(anchor.read_text().replace("shift", "moved"))
     with pytest.raises(ValueError, match="an earlier version: reconstruct the scene again"):
-        add_images(model, tmp_path / "scene", parts[1], *here)
-    shutil.rmtree(tmp_path / "scene" / "windows")
+        changed(add_images, model, here, parts[1])
+    shutil.rmtree(here / "windows")
     with pytest.raises(FileNotFoundError, match="--keep-windows"):
-        add_images(model, tmp_path / "scene", parts[1], *here)
+        changed(add_images, model, here, parts[1])

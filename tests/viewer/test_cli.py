@@ -80,7 +80,7 @@ def test_cameras_of_3d_gaussian_splatting(files: Path) -> None:
     assert len(read_viewer_html(files / "scene.html")) == 60
 
 
-def test_mistakes_end_with_one_line(files: Path, capsys: pytest.CaptureFixture) -> None:
+def test_mistakes_end_with_one_line(files: Path) -> None:
     write_gaussian_ply(files / "empty.ply", scene(0))
     (files / "broken.ply").write_bytes(b"ply\nnonsense")
     (files / "0.png").write_bytes(b"nonsense")
@@ -97,9 +97,7 @@ def test_mistakes_end_with_one_line(files: Path, capsys: pytest.CaptureFixture) 
     for arguments, message in cases:
         with pytest.raises(SystemExit) as ended:
             run(*arguments)
-        flags = ended.value.code == 2
-        said = capsys.readouterr().err.splitlines()[-1] if flags else str(ended.value.code)
-        assert said.startswith("vg2gt view: error: ") == flags == ("--" in message)
+        said = str(ended.value.code)
         assert message in said
         assert "\n" not in said
     assert not (files / "scene.html").exists()

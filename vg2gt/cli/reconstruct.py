@@ -70,11 +70,10 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     """Reconstructs a scene and writes the outputs."""
-    from vg2gt.api import load
+    from vg2gt.api import check_refinement, load
     from vg2gt.memory import RECONSTRUCTION, memory_advice
     from vg2gt.monitor import Monitor
     from vg2gt.outputs.outputs import cost_figures, write_outputs
-    from vg2gt.reconstruction.policy import read_options
     from vg2gt.reconstruction.refined import refinement_lines
     from vg2gt.reconstruction.trust import trust_lines, trusted
     from vg2gt.reconstruction.windows.store import remove, tidy
@@ -86,7 +85,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     how_to_refine = [each for each in overrides if each.startswith(("refine=", "refine."))]
     overrides = [each for each in overrides if each not in how_to_refine]
     _check(options, overrides)
-    read_options("photographs", how_to_refine)  # reports wrong options before any work
+    check_refinement(options.refine, options.quality, how_to_refine)
     with Monitor(show=not options.quiet, device=choose_device(options.device)) as monitor:
         with monitor.stage("load model"):
             ready = load(options.ckpt, overrides=overrides, device=options.device)
@@ -152,16 +151,18 @@ def _check(options: argparse.Namespace, overrides: Sequence[str]) -> None:
 
 def _scene(options: argparse.Namespace, ready: Pipeline, overrides: Sequence[str], monitor: Monitor) -> Scene:
     """Makes a new scene, or adds images to the one in the folder, or removes some; refines it if it is to be."""
+    from vg2gt.api import refined
+    from vg2gt.outputs.saved import read_scene
     from vg2gt.reconstruction.pipeline import add_images, take_out
-    from vg2gt.reconstruction.refined import refined_by_policy
-    from vg2gt.reconstruction.windows.run import window_model
+    from vg2gt.reconstruction.windows.run import device_of, window_model
     from vg2gt.runs.load import find_calibration
 
     renderer, out = replace(ready.renderer, mode=options.mode), Path(options.out)
     if options.add or options.take_out:
-        change = add_images if options.add else take_out
-        scene = change(window_model(ready.model), out, options.images, renderer, monitor, options.window)
-        return refined_by_policy(scene, options.refine, options.quality, overrides, monitor)
+        change, model = add_images if options.add else take_out, window_model(ready.model)
+        old = read_scene(out, renderer, device_of(model))
+        scene = change(model, old, out, options.images, monitor, options.window)
+        return refined(scene, options.refine, options.quality, overrides, monitor)
     calibration = ready.calibration
     if options.calibration is not None:
         calibration = find_calibration(ready.model, ready.weights, options.calibration)

@@ -17,16 +17,17 @@ OUTPUTS = {**MAPS, "video.gif": "the colour of all views as an animation", "vide
 DEFAULT, MOVING = ("color.png",), ("video.mp4",)
 COLORS = {"color.png", "video.gif", "video.mp4"}  # outputs that need no depth and normals
 CAMERAS = "cameras.json"  # next to the scene, as vg2gt reconstruct writes it
-NOTES = {
+_NOTES = {
     "orbit": "an orbit around what the cameras look at",
-    "swing": "an orbit to and fro, because the cameras stand on one side of what they look at",
+    "swing": "an orbit to and fro, because all cameras are on one side of what they look at",
     "path": "a path through the cameras",
     "file": "the frames of the file",
 }
-MAX_SIZE = 16384
+_MAX_SIZE = 16384
 
 if TYPE_CHECKING:
     from vg2gt.io.cameras_json import NamedCamera
+    from vg2gt.reconstruction.camera_path import CameraPath
     from vg2gt.rendering import Renderer
     from vg2gt.types import Gaussians
 
@@ -45,10 +46,15 @@ def main(argv: Sequence[str] | None = None) -> None:
         "viewer) to move through")  # fmt: skip
     add("--out", metavar="DIR", help="where to write; default: the scene's folder")
     add("--size", type=_size, metavar="WxH", help="width and height; default: those of the cameras, 1280x720 of videos")
-    add("--seconds", type=float, metavar="S", help="duration of --orbit or --path; default: by its length")
+    add("--seconds", type=_positive, metavar="S", help="duration of --orbit or --path; default: by its length")
     add("--depth", choices=("median", "expected"), default="median", help="expected requires --mode rasterized")
     add("--interpolate", type=int, metavar="N", help="interpolate smoothly, with N new cameras between each pair")
-    add("--fps", type=float, help=f"frames per second; default: those of camera_path.json, else {FPS:g}")
+    add(
+        "--fps",
+        type=_positive,
+        metavar="N",
+        help=f"frames per second; default: those of camera_path.json, else {FPS:g}",
+    )
     add("--near", type=float, help="near plane in scene units; default: that of report.json next to it, else 0.01")
     add_common_flags(arguments, DEFAULT)
     arguments.set_defaults(save=None)
@@ -66,6 +72,7 @@ def run(options: argparse.Namespace) -> None:
     from vg2gt.monitor import Monitor
     from vg2gt.outputs.outputs import animation, check_folder, check_outputs, cost_figures, feed, map_folder
     from vg2gt.outputs.saved import renderer_of, scene_file
+    from vg2gt.reconstruction.camera_path import CameraPath
     from vg2gt.reconstruction.scene import render_views
     from vg2gt.rendering import Renderer
     from vg2gt.runs.load import choose_device
@@ -81,16 +88,18 @@ def run(options: argparse.Namespace) -> None:
         raise ValueError("--interpolate is for views as they are; --seconds and --fps set the frames of a path")
     scene = scene_file(options.scene)
     folder = check_folder(options.out or scene.parent, outputs, options.overwrite)
-    still = None if moving else _still(options, scene)
+    still = None if moving else _still(options, scene)  # before the scene, which may take long to read
     gaussians = read_gaussians(scene).to(choose_device(options.device))
     if not len(gaussians):
         raise ValueError(f"{scene} holds no Gaussians; there is nothing to render")
-    if still is not None:
-        still = cameras_of_scene(still[0], scene, gaussians), *still[1:]
     renderer = renderer_of(scene.parent, Renderer(mode=options.mode, depth=options.depth))
     if options.near is not None:
         renderer = replace(renderer, near=options.near)
-    cameras, fps, note = still or _moving(options, scene, gaussians, renderer)
+    if still is None:
+        path = _moving(options, scene, gaussians, renderer)
+    else:
+        path = CameraPath(cameras_of_scene(still, scene, gaussians), options.fps or FPS, "views")
+    cameras, fps = path.cameras, path.fps
     if not set(outputs) - COLORS:
         renderer = replace(renderer, geometry=False)
     folder.mkdir(parents=True, exist_ok=True)
@@ -102,13 +111,13 @@ def run(options: argparse.Namespace) -> None:
     cost = cost_figures(monitor)
     seconds = sum(cost["seconds"].values())
     print(f"{len(cameras)} views of {len(gaussians)} Gaussians: {seconds:.1f} s, peak {cost['peak_memory_mib']} MiB")
-    if note:
-        print(f"{note}, {len(cameras) / fps:.1f} s at {fps:g} frames per second")
+    if path.kind in _NOTES:
+        print(f"{_NOTES[path.kind]}, {len(cameras) / fps:.1f} s at {fps:g} frames per second")
     print(f"written: {', '.join(str(folder / name) for name in outputs)}")
 
 
-def _still(options: argparse.Namespace, scene: Path) -> tuple[list[NamedCamera], float, str]:
-    """Returns the cameras of a file as they are, the frame rate of an animation, and no note."""
+def _still(options: argparse.Namespace, scene: Path) -> list[NamedCamera]:
+    """Returns the cameras of a file, resized and interpolated as asked."""
     from vg2gt.inputs.camera_files import interpolate, read_cameras
     from vg2gt.reconstruction.camera_path import resized
 
@@ -122,13 +131,11 @@ def _still(options: argparse.Namespace, scene: Path) -> tuple[list[NamedCamera],
         cameras = [resized(camera, options.size) for camera in cameras]
     if options.interpolate is not None:
         cameras = interpolate(cameras, options.interpolate)
-    return cameras, options.fps or FPS, ""
+    return cameras
 
 
-def _moving(
-    options: argparse.Namespace, scene: Path, gaussians: Gaussians, renderer: Renderer
-) -> tuple[list[NamedCamera], float, str]:
-    """Returns the cameras of the frames of an orbit or a path, the frame rate, and what the path is."""
+def _moving(options: argparse.Namespace, scene: Path, gaussians: Gaussians, renderer: Renderer) -> CameraPath:
+    """Returns the frames of ``--orbit`` or ``--path``."""
     from vg2gt.inputs.camera_files import read_cameras
     from vg2gt.inputs.scene_cameras import cameras_of_scene
     from vg2gt.reconstruction.camera_path import SIZE, glide, median_depth, orbit, read_camera_path
@@ -144,11 +151,18 @@ def _moving(
         cameras = cameras_of_scene(read_cameras(options.path), scene, gaussians)
         unit = median_depth(gaussians, cameras, renderer) or 1.0
         found = glide(cameras, unit, size, fps, options.seconds)
-    return found.cameras, found.fps, NOTES[found.kind]
+    return found
 
 
 def _size(text: str) -> tuple[int, int]:
     sides = text.lower().split("x")
-    if len(sides) != 2 or not all(side.isdigit() and 0 < int(side) <= MAX_SIZE for side in sides):
+    if len(sides) != 2 or not all(side.isdigit() and 0 < int(side) <= _MAX_SIZE for side in sides):
         raise argparse.ArgumentTypeError(f"{text!r} is not a width and height such as 1920x1080")
     return int(sides[1]), int(sides[0])
+
+
+def _positive(text: str) -> float:
+    number = float(text)
+    if not 0 < number < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
+    return number

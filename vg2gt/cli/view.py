@@ -33,18 +33,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     add("--html", type=Path, metavar="FILE", help="the page to write; default: SCENE.html next to the scene")
     add("--open", action="store_true", help="open the page in the browser")
     add("--title", help="title of the page; default: the scene's name, of scene.ply its folder's")
-    arguments = parser.parse_args(argv)
     with errors_in_one_line():
-        from vg2gt.outputs.saved import scene_file
-
-        arguments.scene = scene_file(arguments.scene)
-    known = arguments.scene.parent / CAMERAS
-    if arguments.cameras is None and known.is_file():
-        arguments.cameras = known
-    if arguments.images is not None and arguments.cameras is None:
-        parser.error("--images requires --cameras, which lists the image names")
-    with errors_in_one_line():
-        run(arguments)
+        run(parser.parse_args(argv))
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -52,24 +42,28 @@ def run(arguments: argparse.Namespace) -> None:
     from vg2gt.inputs.camera_files import read_cameras
     from vg2gt.inputs.scene_cameras import cameras_of_scene
     from vg2gt.io import read_gaussians
-    from vg2gt.outputs.saved import renderer_of
+    from vg2gt.outputs.saved import renderer_of, scene_file
     from vg2gt.rendering import Renderer
     from vg2gt.viewer import ViewerScene, scene_title, write_viewer_html
 
-    gaussians = read_gaussians(arguments.scene)
+    file = scene_file(arguments.scene)
+    known = file.parent / CAMERAS
+    source = arguments.cameras or (known if known.is_file() else None)
+    if arguments.images is not None and source is None:
+        raise ValueError("--images requires --cameras, which lists the image names")
+    gaussians = read_gaussians(file)
     if not len(gaussians):
-        raise ValueError(f"{arguments.scene} holds no Gaussians")
+        raise ValueError(f"{file} holds no Gaussians; there is nothing to show")
     if arguments.color is not None:
-        gaussians = _by_trust(arguments.scene, gaussians)
-    title = arguments.title or scene_title(arguments.scene)
-    renderer = renderer_of(arguments.scene.parent, Renderer())
+        gaussians = _by_trust(file, gaussians)
+    title = arguments.title or scene_title(file)
+    renderer = renderer_of(file.parent, Renderer())
     scene = ViewerScene(gaussians, title=title, near=renderer.near, antialiased=renderer.antialiased)
-    if arguments.cameras is not None:
-        cameras = cameras_of_scene(read_cameras(arguments.cameras), arguments.scene, gaussians)
-        folder = arguments.cameras.parent
-        sources = [folder, folder / VIEWS] if arguments.images is None else [arguments.images]
+    if source is not None:
+        cameras = cameras_of_scene(read_cameras(source), file, gaussians)
+        sources = [source.parent, source.parent / VIEWS] if arguments.images is None else [arguments.images]
         scene = replace(scene, cameras=cameras, pictures=_pictures(cameras, sources))
-    path = write_viewer_html(arguments.html or arguments.scene.with_suffix(".html"), scene)
+    path = write_viewer_html(arguments.html or file.with_suffix(".html"), scene)
     print(f"{path}: {len(gaussians)} Gaussians, {path.stat().st_size / 1e6:.1f} MB; open it in a browser")
     if arguments.open:
         webbrowser.open(path.resolve().as_uri())

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
 ROWS = 12  # maximum number of views in report.png
 MESH_PIXELS = 2.0  # edge of a mesh voxel, in pixels at the median depth
-LEAST_BYTES, PHOTO_BYTES = 500_000, 300_000  # written per image: Gaussians and maps, an exported photograph
+_LEAST_BYTES, _PHOTO_BYTES = 500_000, 300_000  # written per image: Gaussians and maps, an exported photograph
 _MESH_DEPTHS = 10.0  # maximum depth of the mesh, in median depths
 
 AddView: TypeAlias = "Callable[[RenderedView], None]"
@@ -75,13 +75,18 @@ def check_folder(folder: str | Path, outputs: Sequence[str], overwrite: bool) ->
         PermissionError: if the folder cannot be created or written to.
     """
     folder = Path(folder).expanduser()
-    place = next(place for place in (folder, *folder.parents) if place.exists())
+    place = _existing(folder)
     if not (place.is_dir() and os.access(place, os.W_OK | os.X_OK)):
         raise PermissionError(f"the output folder {folder} cannot be written to ({place}); choose another")
     there = [target for target in (folder / _target(output) for output in outputs) if target.exists()]
     if there and not overwrite:
         raise FileExistsError(f"{there[0]} already exists; choose another folder or add --overwrite")
     return folder
+
+
+def _existing(folder: Path) -> Path:
+    """Returns the folder, or the nearest one above it that exists."""
+    return next(place for place in (folder, *folder.absolute().parents) if place.exists())
 
 
 def check_space(folder: str | Path, outputs: Sequence[str], images: int) -> None:
@@ -96,10 +101,9 @@ def check_space(folder: str | Path, outputs: Sequence[str], images: int) -> None
         ValueError: if it has not.
     """
     folder = Path(folder).expanduser()
-    place = next(place for place in (folder, *folder.absolute().parents) if place.exists())
-    scenes, photos = ({"scene.ply", "views.npz"} & set(outputs), {"colmap", "nerfstudio"} & set(outputs))
-    needed = images * (LEAST_BYTES * bool(scenes) + PHOTO_BYTES * len(photos))
-    free = shutil.disk_usage(place).free
+    scenes, photos = {"scene.ply", "views.npz"} & set(outputs), {"colmap", "nerfstudio"} & set(outputs)
+    needed = images * (_LEAST_BYTES * bool(scenes) + _PHOTO_BYTES * len(photos))
+    free = shutil.disk_usage(_existing(folder)).free
     if free < needed:
         raise ValueError(
             f"the disk of {folder} has {free / 1e6:.0f} MB left, but at least {needed / 1e6:.0f} MB are needed for "

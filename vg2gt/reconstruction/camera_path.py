@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,9 +22,9 @@ from vg2gt.reconstruction.frame import upright_rotation
 from vg2gt.rendering import Renderer
 from vg2gt.types import Gaussians
 
-SECONDS = {"orbit": 12.0, "swing": 8.0}
 SIZE = (720, 1280)  # default height and width
-SPEED = 0.5  # of a path through cameras: radians and median depths, each second
+_SECONDS = {"orbit": 12.0, "swing": 8.0}
+_SPEED = 0.5  # of a path through cameras: radians and median depths, each second
 _LIMITS = (6.0, 60.0)  # shortest and longest default of such a path, in seconds
 _FACING = math.cos(math.radians(37))  # cameras whose axis is nearer to the target look at it
 _MOST = 0.8  # share of the cameras that must, for an orbit
@@ -44,7 +44,8 @@ class CameraPath:
     Attributes:
         cameras: one per frame, all of one size.
         fps: frames per second.
-        kind: ``orbit``, ``swing`` (a part of one, to and fro), ``path`` (through cameras) or ``file``.
+        kind: ``orbit``, ``swing`` (a part of one, to and fro), ``path`` (through cameras), ``file`` (the frames of a
+            ``camera_path.json``) or ``views`` (cameras as given).
     """
 
     cameras: list[NamedCamera]
@@ -76,8 +77,8 @@ def orbit(
 ) -> CameraPath:
     """Returns an orbit around what the cameras look at, at their median height and distance.
 
-    The axis is the vertical of the cameras. Where they stand on one side only, the path swings to and fro there. Where
-    they do not look at one place (from inside a room), or something would hide it, the path follows the cameras.
+    The axis is the vertical of the cameras. If they are on one side only, the path swings to and fro there. If they do
+    not look at one place (from inside a room), or something would hide it, the path follows the cameras.
 
     Args:
         gaussians: the scene, at least one Gaussian.
@@ -105,7 +106,7 @@ def orbit(
         lens = _lens(cameras, size)
         tested = [replace(lens, world_to_camera=poses(t)) for t in np.arange(_TESTED) / _TESTED]
         if not known or not any(_hidden(gaussians, camera, target, renderer) for camera in tested):
-            count = _count(SECONDS[kind] if seconds is None else seconds, fps)
+            count = _count(_SECONDS[kind] if seconds is None else seconds, fps)
             return CameraPath(
                 _named([replace(lens, world_to_camera=poses(i / count)) for i in range(count)]), fps, kind
             )
@@ -148,7 +149,7 @@ def glide(
     curve[:, 3:] *= 2 / np.linalg.norm(curve[:, 3:], axis=1, keepdims=True)
     reached = np.concatenate(([0.0], np.linalg.norm(np.diff(curve, axis=0), axis=1).cumsum()))
     if seconds is None:
-        seconds = float(np.clip(reached[-1] / SPEED, *_LIMITS))
+        seconds = float(np.clip(reached[-1] / _SPEED, *_LIMITS))
     count = _count(seconds, fps)
     frames = []
     for share in np.interp(np.linspace(0, reached[-1], count), reached, fine):
@@ -240,7 +241,9 @@ def _hidden(gaussians: Gaussians, camera: NamedCamera, target: NDArray[np.float6
     return 0 < _middle_depth(gaussians, camera, renderer) < _BLOCKED * distance
 
 
-def _ring(centers: NDArray[np.float64], target: NDArray[np.float64], down: NDArray[np.float64]) -> tuple[Any, str]:
+def _ring(
+    centers: NDArray[np.float64], target: NDArray[np.float64], down: NDArray[np.float64]
+) -> tuple[Callable[[float], NDArray[np.float64]], str]:
     """Returns the poses of an orbit as a function of the share of it that is done, and its kind."""
     offsets = centers - target
     height = float(np.median(offsets @ -down))

@@ -22,7 +22,6 @@ from vg2gt.io.files import by_number
 from vg2gt.memory import RECONSTRUCTION, memory_advice, note_sizes
 from vg2gt.model import VG2GT, Reconstructor
 from vg2gt.monitor import Monitor
-from vg2gt.outputs.saved import read_scene
 from vg2gt.reconstruction.frame import first_frame, similarity_of
 from vg2gt.reconstruction.scene import Scene
 from vg2gt.reconstruction.surroundings import with_surroundings
@@ -169,15 +168,15 @@ def _scene(parts: _Parts, pictures: Sequence[Picture], renderer: Renderer, is_me
 
 
 def add_images(
-    model: VG2GT, folder: Path, images: ImagesLike, renderer: Renderer, monitor: Monitor, window: int | None = None
+    model: VG2GT, scene: Scene, folder: Path, images: ImagesLike, monitor: Monitor, window: int | None = None
 ) -> Scene:
-    """Adds images, whose cameras are given in the same frame, to the scene in a folder; writes no outputs.
+    """Adds images, whose cameras are given in the same frame, to a scene; writes no outputs.
 
     Args:
         model: model that made the scene.
+        scene: the scene, as read from the folder (:func:`vg2gt.outputs.saved.read_scene`).
         folder: output folder of ``vg2gt reconstruct --keep-windows``.
         images: see :func:`vg2gt.inputs.pictures.find_pictures`.
-        renderer: renderer of the scene.
         monitor: shows and times the stages.
         window: see :func:`reconstruct_with`.
 
@@ -188,31 +187,30 @@ def add_images(
         FileNotFoundError: if the folder keeps no voxels.
         ValueError: if another model made the scene, it has images of the same names, or a removal is unfinished.
     """
-    old, anchor = read_scene(folder, renderer, device_of(model)), _anchor(model, folder)
+    anchor = _anchor(model, folder)
     if any(was_taken_out(place) for place in (folder / WINDOWS).iterdir()):
         raise ValueError(f"a --take-out from {folder} was interrupted: repeat it first")
     with pictures_for(model, images, "given") as pictures:
-        there = sorted({picture.name for picture in pictures} & set(old.names))
+        there = sorted({picture.name for picture in pictures} & set(scene.names))
     if there:
         raise ValueError(f"the scene already has images with these names: {', '.join(there[:10])}; rename them")
     new = reconstruct_with(
         model,
         images,
-        renderer=renderer,
+        renderer=scene.renderer,
         monitor=monitor,
         poses="given",
         window=window,
         window_folder=folder / WINDOWS,
         anchor=anchor,
     )
-    scene = _joined(old, new)
-    return with_surroundings(scene, model.visibility is not None)
+    return with_surroundings(_joined(scene, new), model.visibility is not None)
 
 
 def take_out(
-    model: VG2GT, folder: Path, images: ImagesLike, renderer: Renderer, monitor: Monitor, window: int | None = None
+    model: VG2GT, scene: Scene, folder: Path, images: ImagesLike, monitor: Monitor, window: int | None = None
 ) -> Scene:
-    """Removes images that one command added from the scene in a folder; arguments as for :func:`add_images`.
+    """Removes images that one command added from a scene; arguments as for :func:`add_images`.
 
     Their voxels stay in the folder until ``windows.store.tidy``, which is called once the scene is written.
 
@@ -220,19 +218,19 @@ def take_out(
         FileNotFoundError: if the folder keeps no voxels.
         ValueError: if another model made the scene, or exactly these images were not added together.
     """
-    old, anchor, kept = read_scene(folder, renderer, device_of(model)), _anchor(model, folder), folder / WINDOWS
+    anchor, kept = _anchor(model, folder), folder / WINDOWS
     with pictures_for(model, images, "given") as pictures:
         names = {picture.name for picture in pictures}
         size = window_size(window, len(pictures), kept=True)
         place = kept / set_key(model, pictures, anchor.size, size, anchor)[:12]
     if place not in finished_sets(kept) and not was_taken_out(place):
         raise ValueError("these images were not added by one command: give the same folder and the same --window")
-    left = [view for view, name in enumerate(old.names) if name not in names]
+    left = [view for view, name in enumerate(scene.names) if name not in names]
     if not left:
         raise ValueError("no image would be left in the scene")
     gaussians = gaussians_of(model, kept, anchor, monitor, left_out=place)
     moved = similarity_of(anchor.to_source).apply_gaussians(gaussians)
-    scene = replace(_with_views(old, left), gaussians=moved)
+    scene = replace(_with_views(scene, left), gaussians=moved)
     mark_taken_out(place)
     return with_surroundings(scene, model.visibility is not None)
 
