@@ -7,6 +7,7 @@ import pytest
 import torch
 from PIL import Image, ImageFilter
 
+from tests.inputs.test_foreign import nvm
 from tests.inputs.test_given_cameras import NAMES, put_cameras, put_colmap, put_poses
 from vg2gt.data.base import DataError
 from vg2gt.inputs.cameras import pictures_for
@@ -99,25 +100,40 @@ def test_nothing_left_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="the only image b is black"):
         usable_pictures(find_pictures(tmp_path / "b.png"), Monitor())
     for name in ("a.png", "b.png"):
+        Image.fromarray(scenery(0)).save(tmp_path / name)
+        spoil(tmp_path / name, "cut")
+    with pytest.raises(DataError, match=r"none of the 2 images can be used: a cannot be read \(.*; b cannot be read"):
+        usable_pictures(find_pictures(tmp_path), Monitor())
+    for name in ("a.png", "b.png"):
         (tmp_path / name).write_bytes(b"")
     with pytest.raises(DataError, match=r"none of the 2 images can be used: \S*a\.png cannot be read \(the file is em"):
         find_pictures(tmp_path)
 
 
-@pytest.mark.parametrize("layout", ["cameras.json", "COLMAP", "poses"])
-@pytest.mark.parametrize("how", ["empty", "cut", "black"])
+@pytest.mark.parametrize(
+    ("layout", "how"),
+    [
+        *((layout, "empty") for layout in ("cameras.json", "COLMAP", "poses", "nvm")),
+        ("COLMAP", "cut"),
+        ("poses", "black"),
+    ],
+)
 def test_failed_frames_with_given_cameras(layout, how: str, folder: Path, recording, frames, model, caplog) -> None:
     """A frame of a lens cap cost the others 1.5 dB, a damaged one ended everything."""
-    if layout == "poses":
-        put_poses(folder, recording)
-    else:
-        (put_colmap if layout == "COLMAP" else put_cameras)(folder, frames)
+    poses, focal = frames.world_to_camera.double().numpy(), float(frames.intrinsics[0, 0, 0])
+    {
+        "cameras.json": lambda: put_cameras(folder, frames),
+        "COLMAP": lambda: put_colmap(folder, frames),
+        "poses": lambda: put_poses(folder, recording),
+        "nvm": lambda: nvm(folder, poses, focal, np.zeros(2)),
+    }[layout]()
     spoil(folder / "images" / NAMES[0], how)
     with pictures_for(model, folder) as pictures:
         assert [picture.name for picture in pictures] == [name[:-4] for name in NAMES[1:]]
         assert torch.allclose(pictures[0].read((84, 112)).world_to_camera[0], frames.world_to_camera[1], atol=1e-5)
-    assert NAMES[0][:-4] in caplog.text
-    assert "left out" in caplog.text
+    said = [record.message for record in caplog.records if "left out" in record.message]
+    assert len(said) == 1
+    assert NAMES[0][:-4] in said[0]
 
 
 @pytest.mark.parametrize("suffix", ["png", "jpg"])

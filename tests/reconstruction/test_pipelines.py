@@ -129,7 +129,8 @@ def test_masks_of_photographs_without_cameras(folder: Path, caplog) -> None:
     views = load_views(find_pictures(folder / "images"), SIZE, Monitor())
     assert views.mask.mean((1, 2)).tolist() == [1, 0, 0, 1]
     assert (
-        f"2 of 4 images have no mask in {folder / 'masks'}; all their pixels are used: images/{NAMES[0]}" in caplog.text
+        f"2 of 4 images have no mask in {folder / 'masks'}; all their pixels are used: {folder / 'images' / NAMES[0]}"
+        in caplog.text
     )
     image = Image.new("RGBA", (112, 84), (255, 0, 255, 0))
     views = load_views(find_pictures([image]), SIZE, Monitor())

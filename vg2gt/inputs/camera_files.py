@@ -12,8 +12,9 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from vg2gt.data.sources.colmap_model import largest_of, models_in, models_of
-from vg2gt.data.sources.parsing import IMAGE_SUFFIXES
+from vg2gt.data.sources.parsing import PHOTO_SUFFIXES
 from vg2gt.data.sources.undistortion import pinhole_camera
+from vg2gt.inputs.folders import is_photo
 from vg2gt.inputs.foreign import cameras_to_render
 from vg2gt.io import colmap_images, colmap_intrinsics, colmap_pose, read_cameras_json, read_colmap, read_transforms
 from vg2gt.io.cameras_json import NamedCamera, invert_pose
@@ -28,8 +29,8 @@ def read_cameras(path: str | Path) -> list[NamedCamera]:
 
     Args:
         path: a ``cameras.json`` of ours or of 3D Gaussian Splatting, a ``transforms.json``, a file of Metashape,
-            RealityScan, Bundler or VisualSFM, a folder with a JSON file,
-            or the folder of a COLMAP model or of a scene with one, of which the part with most images is read.
+            RealityScan, Bundler or VisualSFM, a folder with a JSON file, or the folder of a COLMAP model or of a scene
+            with one, of which the part with most images is read.
 
     Raises:
         FileNotFoundError: if the file does not exist.
@@ -43,8 +44,7 @@ def read_cameras(path: str | Path) -> list[NamedCamera]:
     if not path.is_file():
         raise FileNotFoundError(f"no cameras at {path}")
     if is_camera_file(path):
-        folder = path.resolve().parent
-        return cameras_to_render(path, [f for f in folder.rglob("*") if f.suffix.lower() in IMAGE_SUFFIXES])
+        return cameras_to_render(path, [file for file in path.resolve().parent.rglob("*") if is_photo(file)])
     content = read_json(path)
     if isinstance(content, dict) and "frames" in content:
         return _of_transforms(path)
@@ -128,4 +128,4 @@ def interpolate(cameras: Sequence[NamedCamera], between: int) -> list[NamedCamer
 
 def view_stem(name: str) -> str:
     """Returns a view's name without an image file extension; other dots are part of the name."""
-    return name[: -len(suffix)] if (suffix := Path(name).suffix).lower() in IMAGE_SUFFIXES else name
+    return name[: -len(suffix)] if (suffix := Path(name).suffix).lower() in PHOTO_SUFFIXES else name

@@ -10,14 +10,9 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from vg2gt.data.base import DataError
+from vg2gt.data.sources.masks import AmbiguousMaskError
 from vg2gt.inputs.given_cameras import LAYOUTS, describe, given_pictures
-from vg2gt.inputs.pictures import (
-    ImagesLike,
-    Picture,
-    check_pictures,
-    find_pictures,
-    without_copies,
-)
+from vg2gt.inputs.pictures import ImagesLike, Picture, check_pictures, find_pictures, without_copies
 from vg2gt.inputs.sfm import find_cameras, require_pycolmap
 from vg2gt.inputs.usable import usable_pictures
 from vg2gt.io.files import by_number
@@ -120,7 +115,7 @@ def _given_pictures(images: ImagesLike, max_images: int | None, depth: bool, pos
     try:
         return given_pictures(images, max_images, depth=depth)
     except DataError as error:
-        if poses == "given" or depth:
+        if poses == "given" or depth or isinstance(error, AmbiguousMaskError):
             raise
         raise DataError(
             f"cannot use the camera files of {describe(images)}: {error}; --poses sfm ignores them and finds the "

@@ -3,33 +3,24 @@
 from __future__ import annotations
 
 import logging
-import re
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from PIL import features
 
-from vg2gt.data.sources.masks import IMAGE_FOLDERS, is_image_folder
-from vg2gt.data.sources.parsing import IMAGE_SUFFIXES
+from vg2gt.data.sources.parsing import IMAGE_FOLDERS, OTHER_FOLDERS, PHOTO_SUFFIXES, is_image_folder
+from vg2gt.io.errors import some
 from vg2gt.io.files import by_number
 from vg2gt.io.record3d import R3D
 from vg2gt.io.video import VIDEO_SUFFIXES
 
 log = logging.getLogger(__name__)
 
-HEIC_SUFFIXES = (".heic", ".heif")
-PHOTO_SUFFIXES = (*IMAGE_SUFFIXES, *HEIC_SUFFIXES, ".avif", ".jfif", ".jpe")
 # Images that are not read as photographs, and those that cameras store in addition to or instead of them.
 _OTHER_SUFFIXES = (
     *(".arw", ".cr2", ".cr3", ".dng", ".exr", ".gif", ".hdr", ".insp", ".jp2", ".j2k", ".jxl", ".nef", ".orf", ".pef"),
     *(".psd", ".raf", ".raw", ".rw2", ".srw", ".svg", ".tga", ".insv", ".lrv", R3D, *VIDEO_SUFFIXES),
-)
-# Subfolders that hold other things than photographs.
-_NOT_PHOTOS = re.compile(
-    r"[._@].*|masks?|depths?|depth[_-].*|.*[_-]depths?|normals?|conf(idence)?|sparse|dense|stereo|semantics?|labels?|"
-    r"thumb(nail)?s?|images_\d+",
-    re.IGNORECASE,
 )
 _RESULTS = ("report.json", "sfm.json", "scene.ply")  # in folders that vg2gt has written
 
@@ -39,38 +30,37 @@ def is_photo(path: Path) -> bool:
     return path.suffix.lower() in PHOTO_SUFFIXES and not path.name.startswith(".")
 
 
-def can_read(path: Path) -> bool:
-    """Returns whether the installed Pillow can read a photograph's format, by its suffix."""
-    return path.suffix.lower() != ".avif" or bool(features.check("avif"))
-
-
-def image_files(folder: Path) -> list[Path]:
+def image_files(folder: Path, warn: bool = False) -> list[Path]:
     """Lists the photographs of a folder and its subfolders, sorted by the numbers in their names.
 
     If a subfolder with a name of images (``images``, ``color``, ...) has more, only those in it. Folders of masks,
-    depth and the like, hidden ones, and those that ``vg2gt`` has written are left out.
+    depth and the like, hidden ones, links, and those that ``vg2gt`` has written are left out.
+
+    Args:
+        folder: the folder.
+        warn: warn about its images that are not listed, and about images of several folders.
 
     Raises:
         ValueError: if there are none.
     """
-    found = _by_place(folder)
+    inside = image_folders(folder)
+    found = {place: _photos(place, inside if place == folder else []) for place in (folder, *inside)}
     taken = max(found, key=lambda place: len(found[place]))  # the first of equals
     if not found[taken]:
         suffixes = ", ".join(PHOTO_SUFFIXES)
         raise ValueError(f"no images in {folder} (looked for {suffixes}, there and in its subfolders){_others(folder)}")
+    if warn:
+        _name_passed_over(folder, taken, found)
     return sorted(found[taken], key=lambda file: (len(file.relative_to(taken).parts) > 1, by_number(str(file))))
 
 
-def name_passed_over(folder: Path) -> None:
-    """Warns about images of a folder that :func:`image_files` does not list, and says from which folders it does."""
-    found = _by_place(folder)
-    taken = max(found, key=lambda place: len(found[place]))
+def _name_passed_over(folder: Path, taken: Path, found: Mapping[Path, list[Path]]) -> None:
     if taken != folder and found[folder]:
         log.warning("images are taken from %s; %d next to it are ignored", taken, len(found[folder]))
     places = Counter(str(file.parent.relative_to(taken)) for file in found[taken])
     if len(places) > 1:
-        named = ", ".join(f"{place} ({count})" for place, count in places.items())
-        log.warning("the images of several folders in %s are taken together: %s", taken, named)
+        named = [f"{place} ({count})" for place, count in places.items()]
+        log.warning("the images of several folders in %s are taken together: %s", taken, some(named))
     if others := _others(taken):
         log.warning("%s has more than the %d photographs%s", taken, len(found[taken]), others)
 
@@ -82,12 +72,13 @@ def image_folders(folder: Path) -> list[Path]:
     return sorted(found, key=lambda path: (order.get(path.name.lower(), len(order)), by_number(path.name)))
 
 
-def _by_place(folder: Path) -> dict[Path, list[Path]]:
-    """Returns the photographs of a folder, without its image subfolders, and those of each of these."""
-    inside = image_folders(folder)
-    places = {place: [file for file in _walk(place, []) if is_photo(file) and can_read(file)] for place in inside}
-    own = [file for file in _walk(folder, inside) if is_photo(file) and can_read(file)]
-    return {folder: own, **places}
+def _can_read(path: Path) -> bool:
+    """Returns whether the installed Pillow can read a photograph's format, by its suffix."""
+    return path.suffix.lower() != ".avif" or bool(features.check("avif"))
+
+
+def _photos(folder: Path, without: list[Path]) -> list[Path]:
+    return [file for file in _walk(folder, without) if is_photo(file) and _can_read(file)]
 
 
 def _others(folder: Path) -> str:
@@ -96,11 +87,11 @@ def _others(folder: Path) -> str:
         str(file.relative_to(folder))
         for file in _walk(folder, image_folders(folder))
         if not file.name.startswith(".")
-        and (file.suffix.lower() in _OTHER_SUFFIXES or (is_photo(file) and not can_read(file)))
+        and (file.suffix.lower() in _OTHER_SUFFIXES or (is_photo(file) and not _can_read(file)))
     ]
     if not files:
         return ""
-    named = ", ".join(sorted(files, key=by_number)[:10]) + (f" and {len(files) - 10} more" if len(files) > 10 else "")
+    named = some(sorted(files, key=by_number))
     return f"; not read: {named} (save photographs as JPEG or PNG, give a video by itself)"
 
 
@@ -110,7 +101,7 @@ def _walk(folder: Path, without: list[Path]) -> Iterator[Path]:
     for path in sorted(folder.iterdir()):
         if not path.is_dir():
             yield from [path] if path.is_file() else []
-        elif path not in without and not path.is_symlink() and not _NOT_PHOTOS.fullmatch(path.name):
+        elif path not in without and not path.is_symlink() and not OTHER_FOLDERS.fullmatch(path.name):
             folders.append(path)
     for path in folders:
         if not any((path / name).is_file() for name in _RESULTS):

@@ -21,22 +21,21 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from pycolmap import Reconstruction  # pyright: ignore[reportMissingImports]
 
-NEAR = 25.0  # degrees between two images' lines of sight to the same points, below which they must show the same
-CELLS = 10  # along the longer side of an image
-FEWEST = 4  # points of either image in a cell that is compared
-EXPECTED = 3.0  # common points of a compared cell, if both images show the same
-COMPARED = 8  # minimum number of compared cells
-DIFFERENT, ALIKE = 0.1, 0.02  # share of the compared cells without a common point: of different places, of the same
-LEAST_ANGLE, FITTING = 1.5, 0.006  # degrees between the rays of a match, its error as a share of the longer side
-SHARED = 0.02  # of the longer side: between a feature and where another match places it
-STRONG = 30  # matches of a pair that must be in the model
-EXPLAINED = 0.2  # of a pair's matches, below which the model contradicts it
-RIVAL = 0.2  # of an image's best matched pair, from which a contradicted pair counts
-
-OUTVOTED = 2  # images that tell a pair apart, beyond twice those that do not, though it looks alike itself
-FEWEST_FALSE = 3  # pairs of different places, below which nothing is removed
-FEWEST_UNDECIDED = 0.1  # of the placed images, and at least three of them
-ROUNDS = 3  # maximum number of times that the models are made again
+_NEAR = 25.0  # degrees between two images' lines of sight to the same points, below which they must show the same
+_CELLS = 10  # along the longer side of an image
+_FEWEST = 4  # points of either image in a cell that is compared
+_EXPECTED = 3.0  # common points of a compared cell, if both images show the same
+_COMPARED = 8  # minimum number of compared cells
+_DIFFERENT, _ALIKE = 0.1, 0.02  # share of the compared cells without a common point: of different places, of the same
+_LEAST_ANGLE, _FITTING = 1.5, 0.006  # degrees between the rays of a match, its error as a share of the longer side
+_SHARED = 0.02  # of the longer side: between a feature and where another match places it
+_STRONG = 30  # matches of a pair that must be in the model
+_EXPLAINED = 0.2  # of a pair's matches, below which the model contradicts it
+_RIVAL = 0.2  # of an image's best matched pair, from which a contradicted pair counts
+_OUTVOTED = 2  # images that tell a pair apart, beyond twice those that do not, though it looks alike itself
+_FEWEST_FALSE = 3  # pairs of different places, below which nothing is removed
+_FEWEST_UNDECIDED = 0.1  # of the placed images, and at least three of them
+_ROUNDS = 3  # maximum number of times that the models are made again
 
 
 @dataclass(frozen=True)
@@ -44,11 +43,13 @@ class Matches:
     """Matches of all compared pairs of images, as indices of features ``[m, 2]`` by names in sorted order.
 
     Attributes:
+        sizes: width and height of every image in pixels.
         features: positions ``[n, 2]`` of every image's features, in COLMAP's pixels.
         pairs: verified matches.
         raw: all matches of the same pairs: where most are on one plane, only those are verified.
     """
 
+    sizes: dict[str, tuple[int, int]]
     features: dict[str, NDArray[np.float64]]
     pairs: dict[tuple[str, str], NDArray[np.int64]]
     raw: dict[tuple[str, str], NDArray[np.int64]]
@@ -59,7 +60,10 @@ class Matches:
         import pycolmap  # pyright: ignore[reportMissingImports]
 
         with closing(pycolmap.Database.open(database)) as opened:
-            names = {image.image_id: image.name for image in opened.read_all_images()}
+            images = opened.read_all_images()
+            names = {image.image_id: image.name for image in images}
+            cameras = {camera.camera_id: (camera.width, camera.height) for camera in opened.read_all_cameras()}
+            sizes = {image.name: cameras[image.camera_id] for image in images}
             features = {name: np.array(opened.read_keypoints(key)[:, :2], float) for key, name in names.items()}
             raw = dict(zip(*opened.read_all_matches(), strict=True))
             keys, geometries = opened.read_two_view_geometries()
@@ -71,7 +75,7 @@ class Matches:
                 rows = np.asarray(part, np.int64).reshape(-1, 2)
                 if len(rows):
                     table[min(one, other), max(one, other)] = rows if one < other else rows[:, ::-1]
-        return Matches(features, *tables)
+        return Matches(sizes, features, *tables)
 
     def without(self, removed: set[tuple[str, str]]) -> Matches:
         """Returns the matches; those of removed pairs are not verified."""
@@ -91,7 +95,7 @@ class _Seen:
             name: np.array([point.point3D_id if point.has_point3D() else -1 for point in image.points2D], np.int64)
             for name, image in self.images.items()
         }
-        self.sizes = {name: np.array([i.camera.width, i.camera.height]) for name, i in self.images.items()}
+        self.sizes = {name: np.array(size) for name, size in matches.sizes.items()}
         self._features, self._raw = matches.features, matches.raw
         self._rays = {}
         for name, image in self.images.items():
@@ -130,11 +134,11 @@ class _Seen:
                 (along * (rays[0] @ apart) - (rays[1] @ apart)) * scale,
             ]
             place = (centers[0] + depths[0][:, None] * rays[0] + centers[1] + depths[1][:, None] * rays[1]) / 2
-        fits = (depths[0] > 0) & (depths[1] > 0) & (along < np.cos(np.radians(LEAST_ANGLE)))
+        fits = (depths[0] > 0) & (depths[1] > 0) & (along < np.cos(np.radians(_LEAST_ANGLE)))
         for side, name in enumerate(pair):
             pixels, ahead = self._pixels(name, self.poses[name], place)
             far = np.linalg.norm(pixels - self._features[name][rows[:, side]], axis=1)
-            fits &= ahead & (far < FITTING * self.sizes[name].max())
+            fits &= ahead & (far < _FITTING * self.sizes[name].max())
         return np.where(fits[:, None], place, np.nan), along
 
     def _pixels(
@@ -161,7 +165,7 @@ class _Seen:
 
         Where the model does not explain their matches, the images are compared as if the matches were right.
         """
-        as_placed = self.explained(pair, rows) >= EXPLAINED
+        as_placed = self.explained(pair, rows) >= _EXPLAINED
         shares = [self._missing(pair, rows, side, as_placed) for side in range(2)]
         known = [share for share in shares if share is not None]
         return min(known) if len(known) == 2 else None
@@ -183,19 +187,19 @@ class _Seen:
         pixels, ahead = self._pixels(other, pose, places)
         with np.errstate(invalid="ignore"):
             visible = ahead & (pixels >= 0).all(1) & (pixels < size).all(1)
-        near = visible & (cosine > np.cos(np.radians(NEAR))) & (ratio > 1 / 1.5) & (ratio < 1.5)
+        near = visible & (cosine > np.cos(np.radians(_NEAR))) & (ratio > 1 / 1.5) & (ratio < 1.5)
         apart = np.linalg.norm(pixels - self._features[other][partner], axis=1)
         with np.errstate(invalid="ignore"):
-            shared = (partner >= 0) & (apart < SHARED * size.max())
-        expected = _cells(pixels[near], size)
-        theirs = _cells(self._features[other][self.rows[other]], size)
-        common = _cells(pixels[near & shared], size)
+            shared = (partner >= 0) & (apart < _SHARED * size.max())
+        expected = count_cells(pixels[near], size)
+        theirs = count_cells(self._features[other][self.rows[other]], size)
+        common = count_cells(pixels[near & shared], size)
         alike = common > 0
-        if alike.sum() < FEWEST:
+        if alike.sum() < _FEWEST:
             return None
         rate = common[alike].sum() / expected[alike].sum()  # of features found again where both show the same
-        compared = (expected >= max(FEWEST, EXPECTED / rate)) & (theirs >= FEWEST)
-        if compared.sum() < COMPARED:
+        compared = (expected >= max(_FEWEST, _EXPECTED / rate)) & (theirs >= _FEWEST)
+        if compared.sum() < _COMPARED:
             return None
         return float((common[compared] == 0).mean())
 
@@ -206,7 +210,7 @@ class _Seen:
         import pycolmap  # pyright: ignore[reportMissingImports]
 
         known = partner >= 0
-        if known.sum() < STRONG:
+        if known.sum() < _STRONG:
             return None
         options = pycolmap.AbsolutePoseEstimationOptions()
         options.ransac.random_seed = 0
@@ -220,13 +224,18 @@ def _center(pose: NDArray[np.float64]) -> NDArray[np.float64]:
     return -pose[:, :3].T @ pose[:, 3]
 
 
-def _cells(pixels: NDArray[np.float64], size: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Returns the number of pixels ``[n, 2]`` in each cell of an image of (width, height)."""
-    cells = np.clip((pixels / (size.max() / CELLS)).astype(int), 0, CELLS - 1)
-    return np.bincount(cells[:, 1] * CELLS + cells[:, 0], minlength=CELLS * CELLS)
+def count_cells(pixels: NDArray[np.float64], size: Sequence[int] | NDArray[np.int64]) -> NDArray[np.int64]:
+    """Returns the number of pixels ``[n, 2]`` in each of 10 x 10 square cells ``[100]`` of an image of (width, height).
+
+    Ten cells are as long as the longer side, so that some remain empty in an image that is not square.
+    """
+    cells = np.clip((pixels / (max(size) / _CELLS)).astype(int), 0, _CELLS - 1)
+    return np.bincount(cells[:, 1] * _CELLS + cells[:, 0], minlength=_CELLS * _CELLS)
 
 
-def false_pairs(models: Sequence[Reconstruction], matches: Matches, fewest: int = FEWEST_FALSE) -> set[tuple[str, str]]:
+def _false_pairs(
+    models: Sequence[Reconstruction], matches: Matches, fewest: int = _FEWEST_FALSE
+) -> set[tuple[str, str]]:
     """Returns the pairs of images whose matches are of equal sides of different places.
 
     Pairs that are near each other are compared directly. Those that remain unclear follow their neighbours: a pair is
@@ -242,8 +251,8 @@ def false_pairs(models: Sequence[Reconstruction], matches: Matches, fewest: int 
         seen = _Seen(model, matches)
         for pair, rows in matches.pairs.items():
             share = seen.different(pair, rows) if pair in seen.pairs else None
-            if share is not None and (share >= DIFFERENT or share <= ALIKE):
-                verdict[pair] = share <= ALIKE
+            if share is not None and (share >= _DIFFERENT or share <= _ALIKE):
+                verdict[pair] = share <= _ALIKE
     if sum(not alike for alike in verdict.values()) < fewest:
         return set()
     changed = True
@@ -251,7 +260,7 @@ def false_pairs(models: Sequence[Reconstruction], matches: Matches, fewest: int 
         votes = _votes(verdict, matches)
         # first those that look alike by chance
         change = {
-            pair: False for pair, (by, against) in votes.items() if verdict.get(pair) and against >= 2 * by + OUTVOTED
+            pair: False for pair, (by, against) in votes.items() if verdict.get(pair) and against >= 2 * by + _OUTVOTED
         }
         change = change or {
             pair: by > against for pair, (by, against) in votes.items() if pair not in verdict and by != against
@@ -274,7 +283,7 @@ def _votes(verdict: Mapping[tuple[str, str], bool], matches: Matches) -> dict[tu
     }
 
 
-def remove(database: Path, pairs: set[tuple[str, str]]) -> None:
+def _remove(database: Path, pairs: set[tuple[str, str]]) -> None:
     """Removes the matches of pairs from COLMAP's database."""
     import pycolmap  # pyright: ignore[reportMissingImports]
 
@@ -298,11 +307,11 @@ def contradicted_images(models: Sequence[Reconstruction], matches: Matches) -> l
     best: dict[str, int] = {}
     rivals: dict[str, int] = {}
     for pair, rows in matches.pairs.items():
-        against = len(rows) >= STRONG and seen.explained(pair, rows) < EXPLAINED
+        against = len(rows) >= _STRONG and seen.explained(pair, rows) < _EXPLAINED
         for name in pair:
             best[name] = max(best.get(name, 0), len(rows))
             rivals[name] = max(rivals.get(name, 0), len(rows) if against else 0)
-    return sorted(name for name, count in rivals.items() if name in seen.images and count > RIVAL * best[name])
+    return sorted(name for name, count in rivals.items() if name in seen.images and count > _RIVAL * best[name])
 
 
 def unfold(
@@ -316,13 +325,13 @@ def unfold(
         models: models made with all matches.
         again: makes the models again.
     """
-    for number in range(ROUNDS):
-        found = false_pairs(models, matches, FEWEST_FALSE if number == 0 else 1)
+    for number in range(_ROUNDS):
+        found = _false_pairs(models, matches, _FEWEST_FALSE if number == 0 else 1)
         if not found:
             break
-        remove(database, found)
+        _remove(database, found)
         matches = matches.without(found)
         models = again() or models
     undecided = contradicted_images(models, matches)
-    enough = max(3, FEWEST_UNDECIDED * len(models[0].images))
+    enough = max(3, _FEWEST_UNDECIDED * len(models[0].images))
     return models, undecided if len(undecided) >= enough else []

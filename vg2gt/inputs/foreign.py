@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
-
-import numpy as np
 
 from vg2gt.data.base import DataError
 from vg2gt.data.sources.undistortion import is_pinhole, lens_text, undistortion_of
+from vg2gt.inputs.pictures import read_each
 from vg2gt.io.cameras_json import NamedCamera, Photo
 from vg2gt.io.colmap import colmap_intrinsics, require_pycolmap
 from vg2gt.io.errors import FormatError
@@ -72,14 +72,14 @@ def named_camera(camera: ForeignCamera, name: str, size: tuple[int, int]) -> Nam
 
 
 def foreign_cameras(path: Path, files: Sequence[Path]) -> list[tuple[Path, NamedCamera]]:
-    """Returns the image files that a file of cameras names, with their cameras.
+    """Returns the image files that a file of cameras names, with their cameras; damaged images are left out by name.
 
     Raises:
-        DataError: if it is damaged, or a camera does not fit its image.
+        DataError: if the file is damaged, a camera does not fit its image, or no image is left.
     """
     try:
-        pairs = matched(read_photogrammetry(path), files).items()
-        return [(file, named_camera(camera, file.name, image_size(file, ""))) for file, camera in pairs]
+        cameras = matched(read_photogrammetry(path), files)
+        return read_each(cameras, lambda file: (file, named_camera(cameras[file], file.name, image_size(file, ""))))
     except DataError:
         raise
     except ValueError as error:
@@ -99,8 +99,5 @@ def cameras_to_render(path: Path, files: Sequence[Path]) -> list[NamedCamera]:
         size = camera.size or (image_size(images[id(camera)], "") if id(camera) in images else None)
         if size is None:
             raise FormatError(f"{path} does not tell the size of {camera.name}: put its images next to it")
-        named = named_camera(camera, camera.name or "view", size)
-        found.append(
-            NamedCamera(named.name, named.width, named.height, np.array(named.intrinsics), named.world_to_camera)
-        )
+        found.append(replace(named_camera(camera, camera.name or "view", size), photo=None))
     return found

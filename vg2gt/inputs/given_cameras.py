@@ -31,15 +31,14 @@ from vg2gt.inputs.pictures import (
     existing_path,
     frame_of,
     mask_for,
-    name_left_out,
-    reason_of,
+    read_each,
     shrunk,
     with_unique_names,
 )
 from vg2gt.io.cameras_json import NamedCamera, Photo, read_cameras_json
-from vg2gt.io.errors import FormatError
+from vg2gt.io.errors import FormatError, some
 from vg2gt.io.files import read_json
-from vg2gt.io.image_files import is_damaged, read_color
+from vg2gt.io.image_files import read_color
 from vg2gt.io.nerfstudio import read_transforms
 from vg2gt.io.photogrammetry import is_camera_file
 from vg2gt.io.record3d import R3D
@@ -248,8 +247,7 @@ def _name_missing(pictures: list[Picture], folder: Path, others: set[Path]) -> N
 
 def _name_left_out(names: Sequence[str], where: str) -> None:
     if names:
-        shown = ", ".join(names[:10]) + (f" and {len(names) - 10} more" if len(names) > 10 else "")
-        log.warning("%s has no cameras for %d images, which are left out: %s", where, len(names), shown)
+        log.warning("%s has no cameras for %d images, which are left out: %s", where, len(names), some(names))
 
 
 def _unique(named: Sequence[tuple[str, NamedCamera]]) -> dict[str, NamedCamera]:
@@ -281,17 +279,8 @@ def _from_cameras_json(path: Path, folder: Path) -> list[Picture] | None:
     ):
         log.warning("%s describes undistorted images and is ignored for the photos in %s", path, folder)
         return None
-    faults: dict[str, str] = {}
-    pictures = []
-    for file, camera in known:
-        try:
-            pictures.append(_photo(file, camera, path))
-        except DataError as error:
-            if not is_damaged(file):
-                raise
-            faults[str(file)] = reason_of(error)
-    name_left_out(faults, len(known))
-    return pictures
+    with_cameras = dict(known)
+    return read_each(with_cameras, lambda file: _photo(file, with_cameras[file], path))
 
 
 def _of_camera_file(path: Path) -> list[Picture]:
@@ -363,4 +352,4 @@ def _photo(path: Path, camera: NamedCamera, cameras: Path, as_stored: bool = Fal
 def describe(images: Any) -> str:
     """Describes the input in a few words, for messages."""
     items = [str(item) if isinstance(item, (str, Path)) else type(item).__name__ for item in as_items(images)]
-    return ", ".join(items[:3]) + (f" and {len(items) - 3} more" if len(items) > 3 else "")
+    return some(items, 3)

@@ -10,9 +10,9 @@ from scipy.cluster.vq import kmeans2, vq
 
 DISTANCES = (1, 2, 4, 8, 16)  # to the paired photographs in the given order
 ALIKE = 10  # similar photographs per photograph
-APART = 3  # they are more than this far apart in the order: frames of a video would all be neighbours
-WORDS, ROUNDS, SAMPLE = 64, 10, 20_000  # clusters, iterations and sampled features of k-means
-SEED = 0
+_APART = 3  # they are more than this far apart in the order: frames of a video would all be neighbours
+_WORDS, _ROUNDS, _SAMPLE = 64, 10, 20_000  # clusters, iterations and sampled features of k-means
+_SEED = 0
 
 
 def likely_pairs(descriptors: Sequence[NDArray[np.uint8]]) -> list[tuple[int, int]]:
@@ -30,7 +30,7 @@ def likely_pairs(descriptors: Sequence[NDArray[np.uint8]]) -> list[tuple[int, in
         for j in np.argsort(-likeness[i], kind="stable").tolist():
             if len(taken) > ALIKE:
                 break
-            if min(abs(j - k) for k in taken) > APART:
+            if min(abs(j - k) for k in taken) > _APART:
                 taken.append(j)
                 pairs.add((min(i, j), max(i, j)))
     return sorted(pairs, key=lambda pair: pair[::-1])
@@ -41,9 +41,9 @@ def _vlad(descriptors: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
     everything = np.concatenate([np.zeros((0, 128), np.uint8), *descriptors])
     if not len(everything):
         return np.zeros((len(descriptors), 1), np.float32)
-    chosen = np.random.default_rng(SEED).permutation(len(everything))[:SAMPLE]
+    chosen = np.random.default_rng(_SEED).permutation(len(everything))[:_SAMPLE]
     sample = everything[chosen].astype(np.float32)
-    words, _ = kmeans2(sample, sample[:WORDS], ROUNDS, minit="matrix")
+    words, _ = kmeans2(sample, sample[:_WORDS], _ROUNDS, minit="matrix")
     found = np.zeros((len(descriptors), *words.shape), np.float32)
     for row, own in enumerate(descriptors):
         features = own.astype(np.float32)

@@ -99,7 +99,7 @@ class Panorama:
         return grid_sample(wrapped, grid[None], "bilinear", padding_mode="border", align_corners=False)
 
 
-def described_panorama(path: Path, size: Size) -> Panorama | None:
+def _described_panorama(path: Path, size: Size) -> Panorama | None:
     """Returns the panorama that an image's XMP metadata (GPano) describe; None if they describe none.
 
     Args:
@@ -130,7 +130,7 @@ def find_panoramas(files: Sequence[tuple[Path, Size]]) -> dict[Path, Panorama]:
     Images of twice the width without XMP metadata are taken for panoramas if most of them continue from the right
     border to the left one and have poles.
     """
-    found = {path: known for path, size in files if (known := described_panorama(path, size)) is not None}
+    found = {path: known for path, size in files if (known := _described_panorama(path, size)) is not None}
     others = [(path, size) for path, size in files if path not in found and size[1] == 2 * size[0] and size[0] >= 64]
     if others and sum(continues(path) for path, _ in others) * 2 > len(others):
         found |= {path: Panorama(size, size) for path, size in others}

@@ -7,10 +7,10 @@ import importlib.util
 import itertools
 import logging
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 import torch
@@ -21,10 +21,11 @@ from torch import Tensor
 from vg2gt.data.base import Frames
 from vg2gt.data.sources.masks import FOLDER as MASKS
 from vg2gt.data.sources.masks import joined_masks, mask_beside, resized_mask, warn_without_mask
+from vg2gt.data.sources.parsing import HEIC_SUFFIXES, PHOTO_SUFFIXES
 from vg2gt.data.transforms import from_bytes, to_bytes
-from vg2gt.inputs.folders import HEIC_SUFFIXES, PHOTO_SUFFIXES, image_files, is_photo, name_passed_over
+from vg2gt.inputs.folders import image_files, is_photo
 from vg2gt.inputs.panoramas import Panorama, find_panoramas, whole_pixels
-from vg2gt.io.errors import DataError
+from vg2gt.io.errors import DataError, some
 from vg2gt.io.image_files import focal_length, image_size, is_damaged, read_color, read_mask, read_mask_file
 from vg2gt.io.images import color_image, has_alpha
 from vg2gt.io.photogrammetry import is_camera_file
@@ -34,6 +35,8 @@ from vg2gt.io.video import VIDEO_SUFFIXES, VideoFrames, count_frames, read_video
 log = logging.getLogger(__name__)
 
 ImagesLike: TypeAlias = "str | Path | Image.Image | NDArray[Any] | Tensor | Sequence[Any]"
+
+T = TypeVar("T")
 
 _HOLDS_PICTURES = (*PHOTO_SUFFIXES, R3D)
 VIDEO_FRAMES = 32  # frames taken from a video by default
@@ -100,10 +103,12 @@ def find_pictures(images: ImagesLike, max_images: int | None = None) -> list[Pic
         raise ValueError("there are no images to reconstruct; give image files, a folder of them, or a video")
     taken = evenly(chosen, max_images)
     photos = [picture.path for picture in taken if picture.path is not None]
-    masks = {place / MASKS for photo in photos for place in (photo.parent, photo.parent.parent)}
-    if known := sorted(folder for folder in masks if folder.is_dir()):
-        lacking = [_below(photo, known[0].parent) for photo in photos if mask_beside(photo) is None]
-        warn_without_mask(lacking, len(photos), known[0], "masks")
+    masks = {photo: mask_beside(photo) for photo in photos}
+    folders = {place / MASKS for photo in photos for place in (photo.parent, photo.parent.parent)}
+    known = sorted(str(folder) for folder in folders if folder.is_dir())
+    if known or any(masks.values()):
+        lacking = [str(photo) for photo, mask in masks.items() if mask is None]
+        warn_without_mask(lacking, len(masks), (known or [MASKS])[0])
     return with_unique_names(taken)
 
 
@@ -193,11 +198,6 @@ def frame_of(pixels: NDArray[np.uint8], mask: NDArray[np.float32] | None = None)
     return Frames(images.contiguous(), torch.zeros_like(images[:, 0]), poses, intrinsics, mask=counts)
 
 
-def _below(path: Path, folder: Path) -> str:
-    """Returns a file's path relative to a folder, or as it is if it is elsewhere, for messages."""
-    return str(path.relative_to(folder) if folder in path.parents else path)
-
-
 def mask_for(path: Path, upright: bool = True, content: bytes | None = None) -> NDArray[np.float32] | None:
     """Returns the pixel weights of a photograph: the product of its alpha and its mask file (:func:`mask_beside`)."""
     parts = [read_mask(path, "", content=content, upright=upright)]
@@ -213,9 +213,7 @@ def _pictures(item: Any, max_images: int | None, faults: dict[str, str]) -> list
         return _from_memory(item)
     path = existing_path(item)
     if path.is_dir():
-        files = image_files(path)
-        name_passed_over(path)
-        return _photos(files, faults)
+        return _photos(image_files(path, warn=True), faults)
     if is_camera_file(path):
         raise ValueError(f"{path} is a file of cameras, which are not used here: give the folder of its images")
     if is_archive(path):
@@ -223,19 +221,14 @@ def _pictures(item: Any, max_images: int | None, faults: dict[str, str]) -> list
         if not files:
             raise ValueError(f"{path} holds no images (rgbd/0.jpg and so on): is it a recording of Record3D?")
         return [_photo(file, read_recorded) for file in files.values()]
-    return (
-        _video(path, max_images or VIDEO_FRAMES) if path.suffix.lower() in VIDEO_SUFFIXES else _photos([path], faults)
-    )
+    if path.suffix.lower() in VIDEO_SUFFIXES:
+        return _video(path, max_images or VIDEO_FRAMES)
+    return _photos([path], faults)
 
 
 def _photos(files: Sequence[Path], faults: dict[str, str]) -> list[Picture]:
     """Returns photographs, panoramas as the faces of a cube; what is wrong with others is added to ``faults``."""
-    photos: dict[Path, Picture] = {}
-    for file in files:
-        try:
-            photos[file] = _photo(file)
-        except DataError as error:
-            faults[str(file)] = reason_of(error)
+    photos = _readable(files, _photo, faults)
     panoramas = find_panoramas([(file, photo.size) for file, photo in photos.items()])
     if panoramas:
         first = next(iter(panoramas)).name
@@ -245,6 +238,31 @@ def _photos(files: Sequence[Path], faults: dict[str, str]) -> list[Picture]:
         for file, photo in photos.items()
         for picture in (_faces(photo, file, panoramas[file]) if file in panoramas else [photo])
     ]
+
+
+def _readable(files: Iterable[Path], read: Callable[[Path], T], faults: dict[str, str]) -> dict[Path, T]:
+    """Returns what ``read`` makes of image files; what is wrong with damaged ones is added to ``faults``, by path."""
+    found: dict[Path, T] = {}
+    for file in files:
+        try:
+            found[file] = read(file)
+        except DataError as error:
+            if not is_damaged(file):
+                raise
+            faults[str(file)] = reason_of(error)
+    return found
+
+
+def read_each(files: Collection[Path], read: Callable[[Path], T]) -> list[T]:
+    """Returns what ``read`` makes of each image file; damaged ones are left out and named in a warning.
+
+    Raises:
+        DataError: if no image is left, or ``read`` raises it for one that is not damaged.
+    """
+    faults: dict[str, str] = {}
+    found = _readable(files, read, faults)
+    name_left_out(faults, len(files))
+    return list(found.values())
 
 
 def reason_of(error: DataError) -> str:
@@ -266,8 +284,7 @@ def name_left_out(faults: Mapping[str, str], count: int) -> None:
         return
     if count == 1:
         raise DataError(" ".join(("the only image", *next(iter(faults.items())))))
-    named = [f"{name} {fault}" for name, fault in faults.items()]
-    said = "; ".join(named[:10]) + (f"; and {len(named) - 10} more" if len(named) > 10 else "")
+    said = some([f"{name} {fault}" for name, fault in faults.items()], separator="; ")
     if len(faults) == count:
         raise DataError(f"none of the {count} images can be used: {said}")
     log.warning("%d of %d images are left out: %s", len(faults), count, said)
@@ -387,7 +404,7 @@ def without_copies(pictures: Sequence[Picture]) -> list[Picture]:
         if key is not None:
             first[key] = picture.name
     if copies:
-        log.warning("%d images are copies of others and are left out: %s", len(copies), ", ".join(copies[:10]))
+        log.warning("%d images are copies of others and are left out: %s", len(copies), some(copies))
     return found
 
 

@@ -38,7 +38,7 @@ from vg2gt.inputs.likely_pairs import likely_pairs
 from vg2gt.inputs.motion import check_motion, why_not_placed
 from vg2gt.inputs.pictures import SFM_SOURCE, UNKNOWN_LENS, Picture, digest
 from vg2gt.io.colmap import EXTRA, quiet_colmap
-from vg2gt.io.errors import FormatError
+from vg2gt.io.errors import FormatError, some
 from vg2gt.io.files import read_json, whole_folder, write_json
 from vg2gt.monitor import Monitor
 
@@ -124,7 +124,7 @@ def find_cameras(pictures: Sequence[Picture], folder: Path, monitor: Monitor) ->
             "%d of the %d images used fit at two places: sides of the scene look alike, and nothing around them tells "
             "them apart, so parts of the scene may lie on top of each other. Check the cameras; photograph it again on "
             "a ground with texture, such as a newspaper, or mark one side: %s",
-            len(undecided), len(state["images"]), ", ".join(undecided[:10]),
+            len(undecided), len(state["images"]), some(undecided),
         )  # fmt: skip
     wide = [picture.name for picture in pictures if picture.size[1] == 2 * picture.size[0]]
     badly = state.get("error", 0) > _LARGE_ERROR or len(state["left_out"]) > len(pictures) / 4
@@ -171,7 +171,7 @@ def _solve(pictures: Sequence[Picture], folder: Path, key: str, monitor: Monitor
         _find_features(work, lenses, names, monitor)
         _match(work, names, monitor)
         matches = Matches.read(work / "database.db")
-        check_motion(matches, {name: (key[1], key[0]) for key, members in lenses.items() for name in members})
+        check_motion(matches)
         models = _map(work, len(names), monitor)
         if not models:
             raise ValueError(

@@ -100,22 +100,23 @@ def usable_pictures(pictures: Sequence[Picture], monitor: Monitor) -> list[Pictu
                 faults[picture.name] = reason_of(error)
             else:
                 looks[picture.name] = _look(pixels)
-                if not picture.lens and not picture.has_depth:
-                    own = borders.setdefault(picture.size, _Borders(pixels.shape[:2]))
-                    own.add(pixels.max(2))
+                if _may_have_borders(picture):
+                    borders.setdefault(picture.size, _Borders(pixels.shape[:2])).add(pixels.max(2))
             advance()
     faults |= _faults(looks)
     name_left_out(faults, len(pictures))
     masks = {size: mask for size, own in borders.items() if (mask := own.mask()) is not None}
     found = [each for each in pictures if each.name not in faults]
-    bordered = [each for each in found if not each.lens and not each.has_depth and each.size in masks]
+    bordered = {each.name: masks[each.size] for each in found if _may_have_borders(each) and each.size in masks}
     if bordered:
-        share = np.mean([1 - masks[each.size].mean() for each in bordered])
-        log.warning(
-            "%d images have black borders, %.1f %% of their pixels, which are masked", len(bordered), share * 100
-        )
-    names = {each.name for each in bordered}
-    return [_masked(each, masks[each.size]) if each.name in names else each for each in found]
+        share = 100 * np.mean([1 - mask.mean() for mask in bordered.values()])
+        log.warning("%d images have black borders, %.1f %% of their pixels, which are masked", len(bordered), share)
+    return [_masked(each, bordered[each.name]) if each.name in bordered else each for each in found]
+
+
+def _may_have_borders(picture: Picture) -> bool:
+    """Returns whether borders of a picture are to be looked for: not where we undistort it, nor with depth."""
+    return not picture.lens and not picture.has_depth
 
 
 def _small(picture: Picture) -> NDArray[np.uint8]:
@@ -149,19 +150,23 @@ def _curvatures(grey: NDArray[np.float32], step: int) -> NDArray[np.float64]:
 
 def _faults(looks: dict[str, _Look]) -> dict[str, str]:
     """Returns what is wrong with pictures that show nothing, some of it by comparison with the others."""
+    if not looks:
+        return {}
     several = len(looks) >= _FEWEST
-    usual = {name: np.median([getattr(each, name) for each in looks.values()]) for name in ("black", "white", "detail")}
-    faults = {}
-    for name, look in looks.items():
-        for kind, said in (("black", "is black"), ("white", "is over-exposed")):
-            limit = _NEARLY_ALL if several and usual[kind] < _USUAL else _ALL
-            if getattr(look, kind) >= limit:
-                faults[name] = said
-        if name not in faults and look.spread < _FLAT:
-            faults[name] = "is of one colour"
-        if name not in faults and several and look.detail < _BLURRED * usual["detail"]:
-            faults[name] = "is blurred"
-    return faults
+    black, white, detail = (
+        float(np.median([getattr(look, name) for look in looks.values()])) for name in ("black", "white", "detail")
+    )
+
+    def fault(look: _Look) -> str:
+        if look.black >= (_NEARLY_ALL if several and black < _USUAL else _ALL):
+            return "is black"
+        if look.white >= (_NEARLY_ALL if several and white < _USUAL else _ALL):
+            return "is over-exposed"
+        if look.spread < _FLAT:
+            return "is of one colour"
+        return "is blurred" if several and look.detail < _BLURRED * detail else ""
+
+    return {name: found for name, look in looks.items() if (found := fault(look))}
 
 
 def _masked(picture: Picture, mask: NDArray[np.float32]) -> Picture:

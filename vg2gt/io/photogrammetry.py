@@ -31,7 +31,7 @@ from vg2gt.io.files import regular
 
 log = logging.getLogger(__name__)
 
-SUFFIXES = (".xml", ".csv", ".out", ".nvm")
+_SUFFIXES = (".xml", ".csv", ".out", ".nvm")
 _SENSOR = 36.0  # millimetres
 _LISTS = ("{}.list.txt", "list.txt", "../list.txt")  # names of Bundler's images, {}: its file
 _RADII = np.linspace(0.01, 1, 60)  # of the largest radius, where a distortion is fitted
@@ -87,7 +87,7 @@ class ForeignCamera:
 
 def is_camera_file(path: Path) -> bool:
     """Returns whether a file has cameras of one of the programs, by its first bytes."""
-    if path.suffix.lower() not in SUFFIXES or not path.is_file():
+    if path.suffix.lower() not in _SUFFIXES or not path.is_file():
         return False
     with path.open("rb") as file:
         head = file.read(4096).lstrip(b"\xef\xbb\xbf \r\n")

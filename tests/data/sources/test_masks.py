@@ -19,7 +19,7 @@ def _put(*files: Path, hidden: str = "") -> None:
         file.parent.mkdir(parents=True, exist_ok=True)
         pixels = np.full((24, 32), 255, np.uint8)
         pixels[:, {"left": slice(0, 16), "right": slice(16, 32)}.get(hidden, slice(0))] = 0
-        Image.fromarray(pixels).convert("RGB" if file.suffix == ".jpg" else "L").save(file)
+        Image.fromarray(pixels).convert("L" if file.suffix == ".png" else "RGB").save(file)
 
 
 @pytest.mark.parametrize(
@@ -31,38 +31,37 @@ def _put(*files: Path, hidden: str = "") -> None:
         ("front/1.jpg", "front/masks/1.png"),
         ("images/front/1.jpg", "masks/front/1.png"),
         ("images/front/1.jpg", "images/masks/front/1.png"),
-        ("rig/front/1.jpg", "masks/rig/front/1.png"),
-        ("front/1.jpg", "masks/1.png"),  # no other folder has an image of that name
+        ("drone/DCIM/100MEDIA/1.jpg", "masks/drone/DCIM/100MEDIA/1.png"),
+        ("front/1.jpg", "masks/1.png"),  # no other folder of photographs has an image of that name
         ("images/1.jpg", "masks/1.png"),  # images_4 holds the same image
     ],
 )
 def test_where_masks_are(tmp_path: Path, image: str, mask: str) -> None:
-    _put(tmp_path / image, tmp_path / mask, tmp_path / "images_4" / "1.jpg", tmp_path / "depth" / "1" / "2.jpg")
-    if "images" not in image:
-        (tmp_path / "images_4" / "1.jpg").unlink()
+    _put(*(tmp_path / name for name in (image, mask, "images_4/1.jpg", "thumbs/1.jpg", "depth/1.png")))
     assert mask_beside(tmp_path / image) == tmp_path / mask
 
 
 @pytest.mark.parametrize(
     ("images", "mask", "better"),
     [
-        (("front/1.jpg", "back/1.jpg"), "masks/1.png", "masks/front/1.jpg.png"),
-        (("images/front/1.jpg", "images/back/1.JPG"), "masks/1.png", "masks/front/1.jpg.png"),
+        (("front/1.jpg", "back/1.jfif"), "masks/1.png", "masks/front/1.jpg.png"),
+        (("images/front/1.jpg", "images/back/1.jpg"), "masks/1.png", "masks/front/1.jpg.png"),
         (("1.jpg", "1.tif"), "masks/1.png", "masks/1.jpg.png"),
     ],
 )
 def test_a_mask_of_two_images_is_refused(tmp_path: Path, images: tuple[str, str], mask: str, better: str) -> None:
-    _put(*(tmp_path / name.replace("JPG", "jpg") for name in images), tmp_path / mask)
-    with pytest.raises(DataError, match=f"name them .*{better}"):
+    _put(*(tmp_path / name for name in images), tmp_path / mask)
+    with pytest.raises(DataError, match=f"name the masks {better} and so on"):
         mask_beside(tmp_path / images[0])
     _put(tmp_path / better)
     assert mask_beside(tmp_path / images[0]) == tmp_path / better
 
 
 def test_cameras_of_transforms_with_nested_and_flat_masks(tmp_path: Path, caplog) -> None:
-    frames = [{"file_path": f"{side}/1.jpg", "transform_matrix": np.eye(4).tolist()} for side in ("front", "back")]
+    names = ("front/1.jpg", "back/1.JPG")
+    frames = [{"file_path": name, "transform_matrix": np.eye(4).tolist()} for name in names]
     (tmp_path / "transforms.json").write_text(json.dumps({"w": 32, "h": 24, "fl_x": 30, "frames": frames}))
-    _put(tmp_path / "front" / "1.jpg", tmp_path / "back" / "1.jpg", tmp_path / "masks" / "1.png")
+    _put(*(tmp_path / name for name in (*names, "masks/1.png")))
     with pytest.raises(DataError, match="may be the mask of"):
         Nerfstudio(str(tmp_path)).load(tmp_path.name, [0, 1])
     (tmp_path / "masks" / "1.png").unlink()

@@ -22,6 +22,7 @@ from vg2gt.data.sources.parsing import expanded
 from vg2gt.data.sources.undistortion import undistortion_of
 from vg2gt.data.transforms import from_bytes, resize_depth, resize_images, resize_to_cover
 from vg2gt.geometry.cameras import resize_intrinsics
+from vg2gt.io.errors import some
 from vg2gt.io.files import write_cached
 from vg2gt.io.image_files import Size, check_size, is_damaged, read_color, read_depth, read_mask, read_mask_file
 
@@ -134,10 +135,11 @@ class FileSource(SceneSource):
     def sound(self, color: Mapping[int, Path]) -> dict[int, Path]:
         """Returns the images, by frame number, without those that cannot be opened if these may be left out."""
         damaged = [i for i, path in color.items() if is_damaged(path)] if self.leave_out_damaged else []
-        if damaged:
-            names = _some([str(color[i]) for i in damaged])
-            log.warning("%d of %d images cannot be read and are left out: %s", len(damaged), len(color), names)
-        return {i: path for i, path in color.items() if i not in damaged} if len(damaged) < len(color) else dict(color)
+        if not damaged or len(damaged) == len(color):  # whoever reads them says what is wrong
+            return dict(color)
+        names = some([str(color[i]) for i in damaged])
+        log.warning("%d of %d images cannot be read and are left out: %s", len(damaged), len(color), names)
+        return {i: path for i, path in color.items() if i not in damaged}
 
     def read_color(self, index: SceneIndex, row: int, least: Size | None = None) -> NDArray[np.uint8]:
         """Decodes the colour image ``[h, w, 3]`` of a row of the index, undistorted.
@@ -226,7 +228,7 @@ class FileSource(SceneSource):
     def scene_index(self, scene: str) -> SceneIndex:
         """Returns the index of a scene, from memory, the cache, or the dataset."""
         if scene not in self._folders:
-            raise DataError(f"no such scene: {scene}; available: {_some(self._folders)}")
+            raise DataError(f"no such scene: {scene}; available: {some(self._folders)}")
         if scene not in self._indices:
             # Indices of a thousand long videos would take gigabytes; forgotten ones are quickly read from the cache.
             if self.index_cache is not None and len(self._indices) >= _INDICES_IN_MEMORY:
@@ -272,7 +274,7 @@ class FileSource(SceneSource):
             inside = self.find(root)
             if not inside:
                 names = sorted(path.name for path in root.iterdir())
-                raise DataError(f"no scene in {root}: expected {self.layout}; found: {_some(names, 5) or 'nothing'}")
+                raise DataError(f"no scene in {root}: expected {self.layout}; found: {some(names, 5) or 'nothing'}")
             for name, folder in inside.items():
                 _add_scene(found, name, folder)
         return found
@@ -284,7 +286,7 @@ class FileSource(SceneSource):
         unknown = [name for name in names if name not in found]
         # A list file covers the whole dataset, but often only a part of it is on disk.
         if unknown and (not isinstance(scenes, str) or len(unknown) == len(names)):
-            raise DataError(f"no such scene: {_some(unknown)}; available: {_some(found)}")
+            raise DataError(f"no such scene: {some(unknown)}; available: {some(found)}")
         if unknown:
             log.warning("skipped %d of the %d scenes listed in %s: not found", len(unknown), len(names), scenes)
         return {name: found[name] for name in names if name in found}
@@ -348,8 +350,3 @@ def _add_scene(found: dict[str, Path], name: str, folder: Path) -> None:
             "their common parent folder"
         )
     found[name] = folder
-
-
-def _some(names: Sequence[str] | Mapping[str, object], most: int = 10) -> str:
-    names = list(names)
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

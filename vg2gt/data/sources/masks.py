@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -11,15 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from vg2gt.data.sources.parsing import IMAGE_SUFFIXES
-from vg2gt.io.errors import DataError
+from vg2gt.data.sources.parsing import OTHER_FOLDERS, PHOTO_SUFFIXES, is_image_folder
+from vg2gt.io.errors import DataError, some
 from vg2gt.io.image_files import Size
 
 log = logging.getLogger(__name__)
 
 FOLDER = "masks"
-IMAGE_FOLDERS = ("images", "color", "rgb", "image", "input")
 _ENDINGS = tuple(each for ending in (".png", ".jpg", ".jpeg", ".bmp") for each in (ending, ending.upper()))
+_LEVELS = 5  # folders above an image in which its masks are looked for
+
+
+class AmbiguousMaskError(DataError):
+    """A mask file may belong to several images."""
 
 
 def mask_of(folder: Path, name: str) -> Path | None:
@@ -35,16 +38,16 @@ def mask_of(folder: Path, name: str) -> Path | None:
 
 
 def mask_beside(image: Path) -> Path | None:
-    """Finds the mask of an image in a folder ``masks`` next to it or up to three folders higher.
+    """Finds the mask of an image in a folder ``masks`` next to it or up to four folders higher.
 
     ``A/images/front/1.jpg`` has the mask ``A/masks/front/1.png``. ``A/masks/1.png`` is also taken, unless other folders
     next to ``front`` have an image of that name.
 
     Raises:
-        DataError: if the mask may be that of another image of the same name.
+        AmbiguousMaskError: if the mask may be that of another image of the same name.
     """
     path = image.absolute()
-    for folder in path.parents[:3]:
+    for folder in path.parents[:_LEVELS]:
         parts = path.relative_to(folder).parts
         if not (folder / FOLDER).is_dir():
             continue
@@ -57,31 +60,32 @@ def mask_beside(image: Path) -> Path | None:
 
 
 def _check_owner(mask: Path, folder: Path, parts: Sequence[str], dropped: int) -> None:
-    """Raises DataError if a mask found without the first ``dropped`` parts of an image's path fits other images too."""
+    """Checks that a mask found without the first ``dropped`` parts of an image's path fits no other image.
+
+    Raises:
+        AmbiguousMaskError: if it does.
+    """
     other = None
     for place, part in enumerate(parts[:dropped]):
         if is_image_folder(part):  # next to it are depth, reduced copies and the like
             continue
         above, rest = folder.joinpath(*parts[:place]), Path(*parts[place + 1 :])
-        places = [each for each in above.iterdir() if each.is_dir() and each.name not in (part, FOLDER)]
+        places = [each for each in above.iterdir() if each.is_dir() and each.name != part]
+        places = [each for each in places if not OTHER_FOLDERS.fullmatch(each.name)]
         other = other or next((found for each in places if (found := _same_stem(each / rest))), None)
     own = folder.joinpath(*parts)
     if mask.stem != own.name and mask.name != own.name:
         other = other or _same_stem(own, own.suffix)
     if other is not None:
-        better = folder / FOLDER / Path(*[part for part in parts[:-1] if not is_image_folder(part)]) / f"{own.name}.png"
-        raise DataError(f"{mask} may be the mask of {own} or of {other}: name them {better} and so on")
+        better = Path(FOLDER, *[part for part in parts[:-1] if not is_image_folder(part)], f"{own.name}.png")
+        names = f"{own.relative_to(folder)} or of {other.relative_to(folder)}"
+        raise AmbiguousMaskError(f"{mask} may be the mask of {names}: name the masks {better} and so on")
 
 
 def _same_stem(image: Path, but: str = "") -> Path | None:
     """Returns an image of the same name with any ending, other than ``but``; None if there is none."""
-    endings = [each for suffix in IMAGE_SUFFIXES for each in (suffix, suffix.upper()) if each.lower() != but.lower()]
+    endings = [each for suffix in PHOTO_SUFFIXES for each in (suffix, suffix.upper()) if each.lower() != but.lower()]
     return next((found for ending in endings if (found := image.with_suffix(ending)).is_file()), None)
-
-
-def is_image_folder(name: str) -> bool:
-    """Returns whether a folder has a name of images (``images``, ``color``, ...) or of reduced ones (``images_4``)."""
-    return re.fullmatch(rf"{'|'.join(IMAGE_FOLDERS)}|images_\d+", name, re.IGNORECASE) is not None
 
 
 def find_masks(folder: Path, names: Mapping[int, str], images: Mapping[int, Path], where: str) -> dict[int, Path]:
@@ -90,26 +94,25 @@ def find_masks(folder: Path, names: Mapping[int, str], images: Mapping[int, Path
     Args:
         folder: folder of masks; need not exist.
         names: image names by frame number, relative to the image folder.
-        images: image files by frame number, whose own masks (:func:`mask_beside`) are taken if there is none by name.
+        images: image files by frame number; masks are found from there (:func:`mask_beside`), or else by name.
         where: the scene, for the message.
 
     Raises:
-        DataError: if a mask may be that of another image of the same name.
+        AmbiguousMaskError: if a mask may be that of another image of the same name.
     """
-    found = {number: mask_of(folder, name) or mask_beside(images[number]) for number, name in names.items()}
+    found = {number: mask_beside(images[number]) or mask_of(folder, name) for number, name in names.items()}
     if not folder.is_dir() and not any(found.values()):
         return {}
-    warn_without_mask([names[number] for number, path in found.items() if path is None], len(names), folder, where)
+    lacking = [names[number] for number, path in found.items() if path is None]
+    warn_without_mask(lacking, len(names), f"{folder} of {where}")
     return {number: path for number, path in found.items() if path is not None}
 
 
-def warn_without_mask(lacking: Sequence[str], count: int, folder: Path, where: str) -> None:
+def warn_without_mask(lacking: Sequence[str], count: int, folder: str) -> None:
     """Warns about ``lacking`` of ``count`` images, if any, that have no mask in a folder of masks."""
     if lacking:
-        log.warning(
-            "%s: %d of %d images have no mask in %s; all their pixels are used: %s",
-            where, len(lacking), count, folder, ", ".join(lacking[:10]),
-        )  # fmt: skip
+        said = "%d of %d images have no mask in %s; all their pixels are used: %s"
+        log.warning(said, len(lacking), count, folder, some(lacking))
 
 
 def joined_masks(masks: Sequence[NDArray[np.float32] | None]) -> NDArray[np.float32] | None:

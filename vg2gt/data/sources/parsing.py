@@ -23,6 +23,15 @@ from vg2gt.io.errors import FormatError
 from vg2gt.io.files import by_number, regular
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".tif", ".tiff", ".webp", ".bmp")
+HEIC_SUFFIXES = (".heic", ".heif")
+PHOTO_SUFFIXES = (*IMAGE_SUFFIXES, *HEIC_SUFFIXES, ".avif", ".jfif", ".jpe")
+IMAGE_FOLDERS = ("images", "color", "rgb", "image", "input")
+OTHER_FOLDERS = re.compile(
+    r"[._@].*|masks?|depths?|depth[_-].*|.*[_-]depths?|normals?|conf(idence)?|sparse|dense|stereo|semantics?|labels?|"
+    r"thumb(nail)?s?|images_\d+",
+    re.IGNORECASE,
+)
+"""Names of folders that hold other things than photographs, or reduced copies of them."""
 
 CORNER_TO_CENTER = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 """Subtract it from intrinsics to move their origin from the corner of the first pixel to its centre."""
@@ -117,7 +126,9 @@ def named_file(folder: Path, name: str, where: str) -> Path:
     return folder / os.path.relpath(path, root)
 
 
-_WHOLE = ("images", "image", "rgb", "color", "input")  # folders that have reduced copies
+def is_image_folder(name: str) -> bool:
+    """Returns whether a folder has a name of images (``images``, ``color``, ...) or of reduced ones (``images_4``)."""
+    return re.fullmatch(rf"{'|'.join(IMAGE_FOLDERS)}|images_\d+", name, re.IGNORECASE) is not None
 
 
 def existing_image(path: Path) -> Path | None:
@@ -129,7 +140,7 @@ def existing_image(path: Path) -> Path | None:
     if path.is_file():
         return path
     folder = path.parent
-    if not folder.is_dir() and folder.name in _WHOLE:  # others, such as cam_1, are cameras of a rig
+    if not folder.is_dir() and folder.name in IMAGE_FOLDERS:  # others, such as cam_1, are cameras of a rig
         reduced = folder.parent.glob(f"{glob.escape(folder.name)}_[0-9]*")
         largest = min(reduced, key=lambda each: by_number(each.name), default=None)
         return None if largest is None else existing_image(largest / path.name)

@@ -176,7 +176,8 @@ class RGBDFolder(FileSource):
             poses = numbered(folder, scene, "frame-*.pose.txt", suffixes=(".txt",))
             cameras = [*_beside(folder), *_beside(folder.parent)]  # in the folder of the frames or of the sequences
         check_found(scene, folder, {"colour images": color, "depth images": depth if self.has_depth else color})
-        color_size = first_size(self.sound(color), scene)
+        sound = self.sound(color)
+        color_size = first_size(sound, scene)
         depth_size = first_size(depth, scene) if self.has_depth else color_size
         if poses is None:
             raise DataError(
@@ -188,7 +189,7 @@ class RGBDFolder(FileSource):
         if self.intrinsics is None:
             known = [path for path in cameras if path.is_file()]
             intrinsics = _read_intrinsics(known, folder, scene, color_size, depth_size)
-        return Recording(color, depth, read, dict.fromkeys(color, intrinsics), color_size, depth_size)
+        return Recording(sound, depth, read, dict.fromkeys(sound, intrinsics), color_size, depth_size)
 
 
 class ScanNet(RGBDFolder):

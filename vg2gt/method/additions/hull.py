@@ -16,12 +16,15 @@ from torch.nn import functional as F
 from vg2gt.geometry.cameras import project, unproject
 from vg2gt.types import Cameras
 
-MARGIN = 2  # pixels around a mask that count as inside
-EMPTY, UNSURE = 0.3, 0.6  # share of the hidden area behind which other views see points: of clean and of rough cut-outs
-RARE, MOST = 0.05, 0.5  # share of a point's views that see it outside, if it is wrong: of clean and of rough cut-outs
-CELLS = 24  # across the longer side of an image, in which the hidden area is counted
-POINTS = 40_000  # points that are projected to count it
-LEAST = 0.02  # share of the pixels that must be hidden
+_MARGIN = 2  # pixels around a mask that count as inside
+_EMPTY, _UNSURE = (
+    0.3,
+    0.6,
+)  # share of the hidden area behind which other views see points: of clean and of rough cut-outs
+_RARE, _MOST = 0.05, 0.5  # share of a point's views that see it outside, if it is wrong: of clean and of rough cut-outs
+_CELLS = 24  # across the longer side of an image, in which the hidden area is counted
+_POINTS = 40_000  # points that are projected to count it
+_LEAST = 0.02  # share of the pixels that must be hidden
 
 
 @dataclass(frozen=True)
@@ -49,20 +52,20 @@ def meaning_of(depth: Tensor, cameras: Cameras, mask: Tensor) -> Meaning:
     border = torch.cat([each.flatten() for each in (mask[:, 0], mask[:, -1], mask[:, :, 0], mask[:, :, -1])])
     is_object = bool(border.gt(0.5).float().mean() < 0.5)
     covered = _covered(depth, cameras, mask)
-    if covered < EMPTY:
-        return Meaning(RARE, is_object)
-    return Meaning(MOST, True) if is_object and covered < UNSURE else Meaning(None, False)
+    if covered < _EMPTY:
+        return Meaning(_RARE, is_object)
+    return Meaning(_MOST, True) if is_object and covered < _UNSURE else Meaning(None, False)
 
 
 def _covered(depth: Tensor, cameras: Cameras, mask: Tensor) -> float:
     """Returns the share of the hidden area behind which other views see points; 1 if too little is hidden."""
     hidden = mask <= 0.5
-    if len(mask) < 2 or hidden.float().mean() < LEAST or not (depth > 0).any():
+    if len(mask) < 2 or hidden.float().mean() < _LEAST or not (depth > 0).any():
         return 1.0
-    step = max(1, round((depth.numel() / POINTS) ** 0.5))
+    step = max(1, round((depth.numel() / _POINTS) ** 0.5))
     grid = (slice(None), slice(step // 2, None, step), slice(step // 2, None, step))
     world = unproject(depth[None], cameras)[0][grid][depth[grid] > 0]  # [N, 3]
-    cell = max(1, max(cameras.size) // CELLS)
+    cell = max(1, max(cameras.size) // _CELLS)
     whole = -F.max_pool2d(-hidden.float()[:, None], cell)[:, 0]  # cells without a visible pixel
     covered = 0.0
     for view in range(len(mask)):
@@ -86,7 +89,9 @@ def outside_hull(points: Tensor, cameras: Cameras, mask: Tensor, share: float) -
     """
     count = torch.zeros(2, len(points), device=points.device)  # views that see a point, and that see it outside
     for view in range(len(mask)):
-        inside = F.max_pool2d((mask[view] > 0.5).float()[None, None], 2 * MARGIN + 1, 1, MARGIN)[0, 0].to(points.device)
+        inside = F.max_pool2d((mask[view] > 0.5).float()[None, None], 2 * _MARGIN + 1, 1, _MARGIN)[0, 0].to(
+            points.device
+        )
         x, y, seen = _pixels(points, cameras.select(slice(view, view + 1)))
         count[0] += seen
         count[1, seen] += 1 - inside[y[seen], x[seen]]
