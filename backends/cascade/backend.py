@@ -2,26 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import ClassVar
 
-import torch
 from torch import Tensor
 
-from backends.base import Backend
-from backends.cascade.network import CascadeNet
+from backends.cascade.network import CascadeEncoding, CascadeNet
 from backends.cascade.planes import coarse_sources
-from backends.sweep.backend import CONFIDENCE, LICENCE
+from backends.sweep.backend import PlaneSweepBackend
 from backends.sweep.network import PosedViews
-from backends.sweep.tokens import DIM, PATCH, TAPS
-from backends.weights import Weights
-from vg2gt.geometry.precision import full_precision
-from vg2gt.types import Geometry, Hints, Tokens
-
-_STATE = ("context", "context_fine", "swept", "origin")
 
 
-class CascadeBackend(Backend):
+class CascadeBackend(PlaneSweepBackend):
     """Cascade plane-sweep multi-view stereo (needs cameras).
 
     Every view is matched with other views over all depths from a fraction of the cameras' distance to infinity; what
@@ -34,44 +25,16 @@ class CascadeBackend(Backend):
         seed: seed of random weights.
 
     Raises:
-        FileNotFoundError: if the weights cannot be found.
-        ValueError: if they do not fit, or ``path`` is missing.
+        FileNotFoundError: if the weights cannot be found, or ``path`` is missing.
+        ValueError: if they do not fit.
     """
 
-    needs_cameras: ClassVar[bool] = True
+    state: ClassVar[tuple[str, ...]] = ("context", "context_fine", "swept", "origin")
 
     def __init__(self, pretrained: bool = True, path: str | None = None, seed: int = 0) -> None:
-        super().__init__("cascade", PATCH, (DIM,) * TAPS, LICENCE, needs_hints=True, predicts_cameras=False)
-        if pretrained and path is None:
-            raise ValueError("backend cascade has no weights in the package: give backend.path=FILE")
-        self.network = Weights(self.name, LICENCE, pretrained, None, None, path, seed).build(CascadeNet)
-        self.freeze()
+        super().__init__("cascade", CascadeNet, pretrained, path, seed)
 
-    @torch.no_grad()
-    def encode(self, images: Tensor, hints: Hints | None = None) -> Tokens:
-        """Matches the views; see :meth:`Backend.encode`. The world frame is that of view 0, in the cameras' unit.
-
-        Raises:
-            ValueError: also if the views have no parallax (one view, or all cameras at the same position).
-        """
-        _, cameras = self.require_parallax(images, hints)
-        encoded = []
-        with full_precision(images):
-            for scene, pictures in enumerate(images.float()):
-                views = PosedViews(pictures, cameras.world_to_camera[scene], cameras.intrinsics[scene])
-                sources = coarse_sources(views.world_to_camera, views.intrinsics, views.size)
-                encoded.append(self.network.encode(self.network.features(pictures), views, sources))
-        taps = [torch.stack([each.taps[tap] for each in encoded]) for tap in range(TAPS)]
-        state = {name: torch.stack([getattr(each, name) for each in encoded]) for name in _STATE}
-        camera = taps[-1].mean(2)  # no camera token, as the network predicts no cameras: use the mean patch token
-        return replace(self.as_tokens(images, taps, camera), state=state | {"cameras": cameras})
-
-    def decode(self, tokens: Tokens) -> Geometry:
-        """Decodes depth and its expected error; see :meth:`Backend.decode`."""
-        scenes, views = tokens.camera.shape[:2]
-        with full_precision(tokens.camera):
-            taps = tuple(tap.float().flatten(0, 1) for tap in tokens.patch)
-            depth, log_scale = self.network.decode(taps, *(tokens.state[name].flatten(0, 1) for name in _STATE))
-            confidence = torch.exp(-log_scale).clamp(*CONFIDENCE)
-        depth, confidence = (each.unflatten(0, (scenes, views)) for each in (depth, confidence))
-        return Geometry(depth, confidence, tokens.state["cameras"], torch.ones_like(depth[:, 0, 0, 0]))
+    def match(self, views: PosedViews, depth_range: Tensor | None) -> CascadeEncoding:
+        """Matches the views of one scene over all depths; see :meth:`PlaneSweepBackend.match`."""
+        sources = coarse_sources(views.world_to_camera, views.intrinsics, views.size)
+        return self.network.encode(self.network.features(views.images), views, sources)

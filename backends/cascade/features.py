@@ -7,7 +7,7 @@ from typing import NamedTuple
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from backends.sweep.features import MATCH_COARSE, FeaturePyramid, unit_groups, upsample
+from backends.sweep.features import MATCH_COARSE, FeaturePyramid, unit_groups
 
 
 class CascadeFeatures(NamedTuple):
@@ -35,12 +35,7 @@ class CascadePyramid(FeaturePyramid):
 
     def forward(self, images: Tensor) -> CascadeFeatures:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Extracts features of images ``[N, 3, H, W]`` in [0, 1]; H and W multiples of 8."""
-        half = self.to_half((images - 0.5) * 3)
-        quarter = self.to_quarter(half)
-        eighth = self.to_eighth(quarter)
-        eighth = F.relu(eighth + upsample(self.from_sixteenth(self.to_sixteenth(eighth)), eighth))
-        quarter = self.merge(quarter + upsample(self.from_eighth(eighth), quarter))
-        half = self.merge_half(half + upsample(self.from_quarter(quarter), half))
+        half, quarter, eighth = self.pyramid(images)
         coarse = unit_groups(self.coarse(quarter))
         pooled = F.avg_pool2d(coarse, 2) + self.eighth(eighth)
         match = (unit_groups(pooled), coarse, unit_groups(self.fine(half)))

@@ -37,7 +37,7 @@ def fused_volume(
     views, sources = warp.sources.shape
     planes, pixels = inverse.shape[1:]
     volume = torch.empty(views, planes, pixels, GROUPS + 1)
-    seen = torch.empty(views, sources, pixels) if given is None else given.contiguous().clone()
+    seen = torch.empty(views, sources, pixels) if given is None else given.contiguous()
     tensors = (channels_last, warp.sources, warp.at_infinity, warp.parallax, inverse)
     weight, bias, weight_out, bias_out = weigh.parameters()
     last = (visible.weight[0], visible.bias) if visible else (torch.zeros(3), torch.zeros(1))

@@ -10,15 +10,14 @@ from torch.nn import functional as F
 
 from backends.cascade.features import CascadeFeatures, CascadePyramid
 from backends.cascade.planes import FARTHEST, Planes, baselines, fine_sources
-from backends.cascade.sweep import Matching, Stage
+from backends.cascade.sweep import Matching
 from backends.sweep.correlate import SourceWarp
 from backends.sweep.features import CONTEXT_COARSE
-from backends.sweep.network import PosedViews
+from backends.sweep.network import PosedViews, Sweep
 from backends.sweep.refine import CELLS, DepthHead, PlainBlock, RefineNet, activate, convex_upsample, slices
-from backends.sweep.tokens import DIM, PATCH, POSITION_CHANNELS, TAPS, TokenBlock, patch_places
+from backends.sweep.tokens import DIM, PATCH, POSITION_CHANNELS, TAPS, TokenBlock, attend, patch_places
 from backends.sweep.views import relative_poses
 from backends.sweep.volume import agreement
-from vg2gt.geometry.cameras import resize_intrinsics
 from vg2gt.geometry.precision import full_precision
 
 PLANES = 64
@@ -29,7 +28,6 @@ _AGREEMENT = (0.1, 0.05)  # widths of the agreement at 1/8 and 1/4
 _BINS = 16  # channels that hold the summed probability of the planes
 _STATED = 1 + 1 + 3 + _BINS  # relative log-depth, mass, agreement, bins
 _SEEN = 32  # channels of the U-Net that the tokens see
-_LOG_DEPTH = 20.0  # maximum absolute log-depth: keeps depth finite for any tokens
 
 
 class CascadeEncoding(NamedTuple):
@@ -52,7 +50,7 @@ class CascadeEncoding(NamedTuple):
     context_fine: Tensor
     swept: Tensor
     origin: Tensor
-    stages: tuple[Stage, ...]
+    stages: tuple[Sweep, ...]
     guess: Tensor
     centers: tuple[Tensor, ...]
 
@@ -95,7 +93,7 @@ class CascadeNet(nn.Module):
         unit = baselines(views.world_to_camera, views.scenes)
         planes = Planes(unit)
         # all depths at 1/8
-        warp = _warp(features.match[0], views, sources, 8)
+        warp = views.warp(features.match[0], sources, 8)
         position = torch.linspace(0, 1, PLANES, device=unit.device).view(1, -1, 1, 1).expand(len(unit), -1, -1, -1)
         first, visible = self.matching[0](features.match[0], position, planes, warp, None, shown)
         matched = -planes.inverse(first.t).log()
@@ -120,7 +118,7 @@ class CascadeNet(nn.Module):
             return share * (matched + 0.1 * change[:, :1]) + (1 - share) * guess, guess, share
 
         place = self._places(blend(change)[0], scale, views, grid)
-        tokens = self._attend(self.blocks[:2], tokens, place, grid, views.scenes)[-1]
+        tokens = attend(self.blocks[:2], tokens, place, grid, views.scenes)[-1]
         filled = F.pad(self.fill(tokens).mT.unflatten(-1, grid), (0, 0, 0, 0, 1, 0))
         center, guess, share = blend(change + filled)
         # twice more, around that, with the best sources
@@ -130,7 +128,7 @@ class CascadeNet(nn.Module):
         best = sources.gather(1, chosen)
         visible = visible.detach().gather(1, chosen[:, :, None, None].expand(-1, -1, *visible.shape[2:]))
         quarter = convex_upsample(center, mask)
-        warp = _warp(features.match[1], views, best, 4)
+        warp = views.warp(features.match[1], best, 4)
         second, visible = self._narrow(1, quarter, _QUARTER, features, planes, warp, visible)
         log_depth = -planes.inverse(second.t).log()
         agreeing = agreement((-log_depth).exp().detach(), warp, _AGREEMENT[1])
@@ -138,12 +136,12 @@ class CascadeNet(nn.Module):
         found = self.begin(torch.cat((features.context, known), 1))
         found = self.end(activate(self.block(found))).float()
         half = convex_upsample(log_depth + 0.1 * found[:, :1], found[:, 1:])
-        third, _ = self._narrow(2, half, _HALF, features, planes, _warp(features.match[2], views, best, 2), visible)
+        third, _ = self._narrow(2, half, _HALF, features, planes, views.warp(features.match[2], best, 2), visible)
         log_depth = -planes.inverse(third.t).log()
         fine = F.pixel_unshuffle(torch.cat((log_depth - scale, third.mass), 1), 4)
         tokens = tokens + self.embed_fine(torch.cat((F.pixel_unshuffle(known, 2), fine), 1).flatten(2).mT)
         place = self._places(F.avg_pool2d(log_depth, 4), scale, views, grid)
-        taps = self._attend(self.blocks[2:], tokens, place, grid, views.scenes)
+        taps = attend(self.blocks[2:], tokens, place, grid, views.scenes)
         sure = F.interpolate(torch.cat((F.avg_pool2d(second.mass, 2), share), 1), size=log_depth.shape[-2:])
         swept = torch.cat((log_depth, third.mass, sure), 1)
         stages, centers = (first, second, third), (center, quarter, half)
@@ -167,7 +165,7 @@ class CascadeNet(nn.Module):
         planes: Planes,
         warp: SourceWarp,
         visible: Tensor,
-    ) -> tuple[Stage, Tensor]:
+    ) -> tuple[Sweep, Tensor]:
         """A stage on planes around the log-depth ``center``; ``visible`` is at half its resolution."""
         count, spacing = spaced
         offsets = torch.arange(count, device=center.device).view(1, -1, 1, 1) - (count - 1) / 2
@@ -175,30 +173,13 @@ class CascadeNet(nn.Module):
         visible = F.interpolate(visible, size=center.shape[-2:], mode="nearest")
         return self.matching[level](features.match[level], position, planes, warp, visible)
 
-    def _attend(
-        self, blocks: nn.ModuleList, tokens: Tensor, place: Tensor, grid: tuple[int, int], scenes: int
-    ) -> list[Tensor]:
-        position = self.position(place)
-        outputs = []
-        for block in blocks:
-            tokens = block(tokens, position, grid, scenes)
-            outputs.append(tokens)
-        return outputs
-
     def _places(self, log_depth: Tensor, scale: Tensor, views: PosedViews, grid: tuple[int, int]) -> Tensor:
-        """Position encodings of the patches, at the given log-depth, in units of the scene's matched depth."""
+        """Embedded positions of the patches, at the given log-depth, in units of the scene's matched depth."""
         depth, unit = log_depth.detach().flatten(1).exp(), scale.flatten().exp()
         with full_precision(depth):
             cameras = (views.world_to_camera, views.intrinsics)
-            return patch_places(depth, *cameras, torch.stack((unit, unit), 1), grid, views.scenes)
-
-    def decode(
-        self, taps: tuple[Tensor, ...], context: Tensor, context_fine: Tensor, swept: Tensor, origin: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Decodes depth and the log-scale of its relative error, each ``[V, H, W]``; see :class:`DepthHead`."""
-        grid = (context.shape[-2] // 2, context.shape[-1] // 2)
-        log_depth, log_scale = self.head(taps, grid, context, context_fine, swept, origin)
-        return log_depth.clamp(-_LOG_DEPTH, _LOG_DEPTH).exp(), log_scale
+            place = patch_places(depth, *cameras, torch.stack((unit, unit), 1), grid, views.scenes)
+        return self.position(place)
 
 
 def _scene_scale(log_depth: Tensor, weight: Tensor, scenes: int) -> Tensor:
@@ -208,10 +189,3 @@ def _scene_scale(log_depth: Tensor, weight: Tensor, scenes: int) -> Tensor:
     mass = (weight.reshape(scenes, -1) + 1e-4).gather(1, order).cumsum(1)
     middle = (mass < 0.5 * mass[:, -1:]).sum(1, keepdim=True)
     return values.gather(1, middle).repeat_interleave(views, 0).view(-1, 1, 1, 1)
-
-
-def _warp(maps: Tensor, views: PosedViews, sources: Tensor, stride: int) -> SourceWarp:
-    """Correspondences of feature maps at ``1 / stride`` of the images, in full precision (half is off by pixels)."""
-    with full_precision(maps):
-        intrinsics = resize_intrinsics(views.intrinsics, 1 / stride, 1 / stride)
-        return SourceWarp(views.world_to_camera, intrinsics, sources, (maps.shape[-2], maps.shape[-1]))

@@ -2,33 +2,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor, nn
 
 from backends.cascade.fused import fused_volume
 from backends.cascade.planes import Planes
 from backends.sweep.correlate import GROUPS, SourceWarp, correlate
-from backends.sweep.volume import VolumeNet, expectation
-
-_VIEWS_AT_A_TIME = 4
-
-
-class Stage(NamedTuple):
-    """Result of one stage.
-
-    Attributes:
-        logits: logits of the planes ``[V, D, h, w]``.
-        position: positions of the planes, ``[V, D, h, w]`` or ``[V, D, 1, 1]``; see :class:`Planes`.
-        t: expected position ``[V, 1, h, w]``.
-        mass: probability mass around it ``[V, 1, h, w]``.
-    """
-
-    logits: Tensor
-    position: Tensor
-    t: Tensor
-    mass: Tensor
+from backends.sweep.network import Sweep
+from backends.sweep.volume import VolumeNet, chunks_of_views, expectation, mean_similarity
 
 
 class Matching(nn.Module):
@@ -59,7 +40,7 @@ class Matching(nn.Module):
         warp: SourceWarp,
         visible: Tensor | None = None,
         shown: Tensor | None = None,
-    ) -> tuple[Stage, Tensor]:
+    ) -> tuple[Sweep, Tensor]:
         """Matches all views; without gradients, a few at a time to save memory.
 
         Args:
@@ -75,17 +56,15 @@ class Matching(nn.Module):
         """
         views, count = position.shape[:2]
         inverse = planes.inverse(position).flatten(2).expand(-1, -1, maps.shape[-2] * maps.shape[-1])
-        step = views if torch.is_grad_enabled() else _VIEWS_AT_A_TIME
         logits, seen = [], []
-        for first in range(0, views, step):
-            part = slice(first, min(first + step, views))
+        for part in chunks_of_views(views):
             given = None if visible is None else visible[part]
             volume, weight = self._volume(maps, inverse[part], warp.select(part), given, shown)
             logits.append(self.volume(volume, count))
             seen.append(weight)
         every = torch.cat(logits)
         t, mass = expectation(every, position)
-        return Stage(every, position, t, mass), torch.cat(seen)
+        return Sweep(every, position, t, mass), torch.cat(seen)
 
     def _volume(
         self, maps: Tensor, inverse: Tensor, warp: SourceWarp, visible: Tensor | None, shown: Tensor | None
@@ -106,8 +85,5 @@ class Matching(nn.Module):
             visible = torch.sigmoid(self.visible(distinct)).reshape(views, sources, *size)
             if shown is not None:
                 visible = visible * shown[warp.first : warp.first + views]
-        weight = (torch.sigmoid(score) * inside * visible.flatten(2)[:, :, None])[..., None]
-        weights = weight.sum(1)  # [V, D, h w, 1]
-        mean = (weight * similarity).sum(1) / (weights + 1e-3)
-        volume = torch.cat((mean, weights / sources), -1).reshape(-1, *size, GROUPS + 1)
-        return volume.permute(0, 3, 1, 2), visible
+        weight = torch.sigmoid(score) * inside * visible.flatten(2)[:, :, None]
+        return mean_similarity(similarity, weight, size), visible

@@ -90,14 +90,18 @@ class FeaturePyramid(nn.Module):
         self.context = conv_norm(48, CONTEXT_COARSE, relu=False)
         self.context_fine = conv_norm(32, CONTEXT_FINE, relu=False)
 
-    def forward(self, images: Tensor) -> Features:
-        """Extracts features of images ``[N, 3, H, W]`` in [0, 1]; H and W multiples of 8."""
+    def pyramid(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Returns feature maps of 32, 48 and 64 channels at 1/2, 1/4 and 1/8 of images; see :meth:`forward`."""
         half = self.to_half((images - 0.5) * 3)
         quarter = self.to_quarter(half)
         eighth = self.to_eighth(quarter)
         eighth = F.relu(eighth + upsample(self.from_sixteenth(self.to_sixteenth(eighth)), eighth))
         quarter = self.merge(quarter + upsample(self.from_eighth(eighth), quarter))
-        half = self.merge_half(half + upsample(self.from_quarter(quarter), half))
+        return self.merge_half(half + upsample(self.from_quarter(quarter), half)), quarter, eighth
+
+    def forward(self, images: Tensor) -> Features:
+        """Extracts features of images ``[N, 3, H, W]`` in [0, 1]; H and W multiples of 8."""
+        half, quarter, _ = self.pyramid(images)
         matching = (unit_groups(self.coarse(quarter)), unit_groups(self.fine(half)))
         return Features(*matching, self.context(quarter), self.context_fine(half))
 

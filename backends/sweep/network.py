@@ -13,16 +13,22 @@ from backends.sweep.features import CONTEXT_COARSE, FeaturePyramid, Features, un
 from backends.sweep.refine import DepthHead, RefineNet, convex_upsample, slices
 from backends.sweep.tokens import PATCH, TokenNet, patch_places
 from backends.sweep.views import agreed_range, choose_sources, view_ranges, wide_range
-from backends.sweep.volume import PlaneSweep, VolumeNet, agreement, expectation, near_and_far, to_inverse
+from backends.sweep.volume import (
+    PlaneSweep,
+    VolumeNet,
+    agreement,
+    chunks_of_views,
+    expectation,
+    near_and_far,
+    to_inverse,
+)
 from vg2gt.geometry.cameras import resize_intrinsics
 from vg2gt.geometry.precision import full_precision
 
 _BINS = 16  # channels that hold the summed probability of the planes
 _FINE_PLANES = 12
 _FINE_REACH = 1.5  # reach of the second sweep on either side, in plane spacings of the first
-_VIEWS_AT_A_TIME = 4
 _FARTHEST = 4.0  # maximum swept depth, in multiples of the farthest plane
-_LOG_DEPTH = 20.0  # maximum absolute log-depth: keeps depth finite for any tokens
 WIDE_PLANES = 64  # planes of the sweeps that find the range
 _BEYOND = (0.5, 3.0)  # factors on near and far of a hint: the range to search
 _RANGE_CELLS = 2000  # maximum cells per feature map in these sweeps
@@ -48,6 +54,12 @@ class PosedViews(NamedTuple):
     def size(self) -> tuple[int, int]:
         """Image ``(height, width)``."""
         return (self.images.shape[-2], self.images.shape[-1])
+
+    def warp(self, maps: Tensor, sources: Tensor, stride: int) -> SourceWarp:
+        """Returns the correspondences of feature maps at ``1 / stride`` of the images with sources ``[V, n]``."""
+        with full_precision(maps):  # half is off by pixels
+            intrinsics = resize_intrinsics(self.intrinsics, 1 / stride, 1 / stride)
+            return SourceWarp(self.world_to_camera, intrinsics, sources, (maps.shape[-2], maps.shape[-1]))
 
 
 class Sweep(NamedTuple):
@@ -121,7 +133,7 @@ class SweepNet(nn.Module):
         Returns:
             The sweep, and the :func:`agreement` of its depths ``[V, 3, h, w]``.
         """
-        warp = _warp(maps, views, sources, stride)
+        warp = views.warp(maps, sources, stride)
         position = torch.linspace(0, 1, planes, device=depth_range.device).view(1, -1, 1, 1)
         inverse = to_inverse(position, depth_range)[..., 0].expand(len(views.images), -1, -1)  # [V, D, 1]
         logits = _match(self.sweep, self.volume, maps, inverse, warp)
@@ -205,7 +217,7 @@ class SweepNet(nn.Module):
         self, fine: Tensor, center: Tensor, views: PosedViews, depth_range: Tensor, sources: Tensor, planes: int
     ) -> Sweep:
         """Second sweep, at 1/2 of the image, around the positions ``center [V, 1, 2 h, 2 w]``."""
-        warp = _warp(fine, views, sources, 2)
+        warp = views.warp(fine, sources, 2)
         reach = _FINE_REACH / (planes - 1)
         offsets = torch.linspace(-reach, reach, _FINE_PLANES, device=fine.device).view(1, -1, 1, 1)
         position = center + offsets  # [V, D, 2 h, 2 w]
@@ -215,25 +227,9 @@ class SweepNet(nn.Module):
         t, mass = expectation(logits, position)
         return Sweep(logits, position, t, mass)
 
-    def decode(
-        self, taps: tuple[Tensor, ...], context: Tensor, context_fine: Tensor, swept: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Decodes depth and the log-scale of its relative error, each ``[V, H, W]``; see :class:`DepthHead`."""
-        grid = (context.shape[-2] // 2, context.shape[-1] // 2)
-        log_depth, log_scale = self.head(taps, grid, context, context_fine, swept)
-        return log_depth.clamp(-_LOG_DEPTH, _LOG_DEPTH).exp(), log_scale
-
 
 def _match(sweep: PlaneSweep, volume: VolumeNet, features: Tensor, inverse: Tensor, warp: SourceWarp) -> Tensor:
     """Logits of the planes ``[V, D, h, w]``; without gradients, in chunks of a few views to save memory."""
     views, planes = inverse.shape[:2]
-    step = views if torch.is_grad_enabled() else _VIEWS_AT_A_TIME
-    parts = [slice(first, min(first + step, views)) for first in range(0, views, step)]
+    parts = chunks_of_views(views)
     return torch.cat([volume(sweep(features, inverse[part], warp.select(part)), planes) for part in parts])
-
-
-def _warp(maps: Tensor, views: PosedViews, sources: Tensor, stride: int) -> SourceWarp:
-    """Correspondences of feature maps at ``1 / stride`` of the images, in full precision (half is off by pixels)."""
-    with full_precision(maps):
-        intrinsics = resize_intrinsics(views.intrinsics, 1 / stride, 1 / stride)
-        return SourceWarp(views.world_to_camera, intrinsics, sources, (maps.shape[-2], maps.shape[-1]))

@@ -13,6 +13,7 @@ RESPONSE = 0.02  # change of log-depth per unit of the tokens' correction channe
 CELLS = 2  # the correction channels hold CELLS x CELLS values per patch
 _SPREAD = 48  # channels per cell after the tokens are spread over the cells
 _UNSURE = -2.5  # log-scale of the relative error before training
+_LOG_DEPTH = 20.0  # maximum absolute log-depth: keeps depth finite for any tokens
 
 
 def activate(x: Tensor) -> Tensor:
@@ -83,7 +84,7 @@ def slices(probability: Tensor, bins: int) -> Tensor:
 
 
 class DepthHead(nn.Module):
-    """Predicts log-depth as that of the sweep plus two corrections.
+    """Predicts depth: log-depth is that of the sweep plus two corrections.
 
     The first correction is linear: the first four channels of the last tap, one per 2x2 cell of the patch, times
     ``RESPONSE``. It makes depth change smoothly with the tokens. The second is predicted from all taps by convolutions.
@@ -107,23 +108,22 @@ class DepthHead(nn.Module):
     def forward(
         self,
         taps: tuple[Tensor, ...],
-        grid: tuple[int, int],
         context: Tensor,
         context_fine: Tensor,
         swept: Tensor,
         origin: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Decodes log-depth and the log-scale of its error, each ``[V, 4 h, 4 w]``.
+        """Decodes depth and the log-scale of its relative error, each ``[V, 4 h, 4 w]``.
 
         Args:
             taps: tokens ``[V, P, DIM]`` of each tap.
-            grid: patches per axis.
             context: ``[V, CONTEXT_COARSE, h, w]``, at 1/4 of the image.
             context_fine: ``[V, CONTEXT_FINE, 2 h, 2 w]``.
             swept: log-depth of the sweep, its probability and further channels, ``[V, stated, 2 h, 2 w]``.
             origin: the first four channels of the last tap for which the first correction is zero ``[V, P, 4]``; None:
                 zero.
         """
+        grid = (context.shape[-2] // CELLS, context.shape[-1] // CELLS)
         # tokens to cells of half a patch: [V, P, DIM] to [V, C, h, w]
         said = torch.cat([norm(tap) for norm, tap in zip(self.norms, taps, strict=True)], -1)
         said = F.pixel_shuffle(self.spread(said).mT.unflatten(-1, grid), CELLS)  # [V, C, h, w]
@@ -138,4 +138,4 @@ class DepthHead(nn.Module):
         log_depth = swept[:, :1] + RESPONSE * correction.float() + 0.25 * log_depth
         both = torch.cat((log_depth, log_scale + _UNSURE), 1)
         full = convex_upsample(both, self.mask(x).float())
-        return full[:, 0], full[:, 1]
+        return full[:, 0].clamp(-_LOG_DEPTH, _LOG_DEPTH).exp(), full[:, 1]

@@ -51,6 +51,17 @@ class TokenBlock(nn.Module):
         return x + self.mlp(self.norm_mlp(x))
 
 
+def attend(
+    blocks: nn.ModuleList, tokens: Tensor, position: Tensor, grid: tuple[int, int], scenes: int
+) -> tuple[Tensor, ...]:
+    """Runs blocks one after the other; returns the outputs of all. Arguments as in :meth:`TokenBlock.forward`."""
+    outputs = []
+    for block in blocks:
+        tokens = block(tokens, position, grid, scenes)
+        outputs.append(tokens)
+    return tuple(outputs)
+
+
 class TokenNet(nn.Module):
     """Embeds patches of ``inputs`` channels and runs blocks that alternate between single views and all views."""
 
@@ -69,11 +80,7 @@ class TokenNet(nn.Module):
             grid: patches per axis.
             scenes: number of scenes that the views belong to.
         """
-        tokens, position = self.embed(patches), self.position(place)
-        taps = []
-        for block in self.blocks:
-            tokens = block(tokens, position, grid, scenes)
-            taps.append(tokens)
+        taps = attend(self.blocks, self.embed(patches), self.position(place), grid, scenes)
         return tuple(tap.float() for tap in taps[-TAPS:])
 
 

@@ -9,6 +9,7 @@ from torch.nn import functional as F
 from backends.sweep.correlate import BEHIND, GROUPS, SourceWarp, correlate
 from backends.sweep.features import upsample
 
+_VIEWS_AT_A_TIME = 4
 _WINDOW = 2  # planes on either side of the most likely one to average over
 _AGREEMENT_WIDTH = 0.03  # relative depth difference at which agreement falls to 1/e
 
@@ -31,6 +32,29 @@ def from_inverse(inverse: Tensor, depth_range: Tensor) -> Tensor:
     return (inverse - 1 / far) / (1 / near - 1 / far)
 
 
+def chunks_of_views(views: int) -> list[slice]:
+    """Splits a number of views into slices to be matched one after the other: all views at once with gradients."""
+    step = views if torch.is_grad_enabled() else _VIEWS_AT_A_TIME
+    return [slice(first, min(first + step, views)) for first in range(0, views, step)]
+
+
+def mean_similarity(similarity: Tensor, weight: Tensor, size: tuple[int, int]) -> Tensor:
+    """Averages similarities over the sources.
+
+    Args:
+        similarity: ``[V, n, D, h w, GROUPS]``.
+        weight: weights of the sources ``[V, n, D, h w]``.
+        size: ``(h, w)``.
+
+    Returns:
+        Weighted mean similarity per group, and the mean weight of the sources: ``[V D, GROUPS + 1, h, w]``.
+    """
+    weights = weight.sum(1)[..., None]  # [V, D, h w, 1]
+    mean = (weight[..., None] * similarity).sum(1) / (weights + 1e-3)
+    volume = torch.cat((mean, weights / weight.shape[1]), -1)  # [V, D, h w, GROUPS + 1]
+    return volume.reshape(-1, *size, GROUPS + 1).permute(0, 3, 1, 2)
+
+
 class PlaneSweep(nn.Module):
     """Group-wise similarity of every view with its sources on depth planes, averaged with learned source weights."""
 
@@ -47,18 +71,13 @@ class PlaneSweep(nn.Module):
             warp: correspondences of all or some of the views.
 
         Returns:
-            Weighted mean similarity per group, and the mean weight of the sources: ``[V D, GROUPS + 1, h, w]``.
+            The :func:`mean_similarity`, ``[V D, GROUPS + 1, h, w]``.
         """
         size = (features.shape[-2], features.shape[-1])
-        views, sources = warp.sources.shape
-        planes = inverse.shape[1]
         similarity, inside = correlate(features, inverse.expand(-1, -1, size[0] * size[1]), warp)
         images = similarity.reshape(-1, *size, GROUPS).permute(0, 3, 1, 2)  # [V n D, G, h, w]
-        weight = torch.sigmoid(self.weigh(images).float()).reshape(*inside.shape, 1) * inside[..., None]
-        weights = weight.sum(1)  # [V, D, h w, 1]
-        mean = (weight * similarity).sum(1) / (weights + 1e-3)
-        volume = torch.cat((mean, weights / sources), -1)  # [V, D, h w, G + 1]
-        return volume.reshape(views * planes, *size, GROUPS + 1).permute(0, 3, 1, 2)
+        weight = torch.sigmoid(self.weigh(images).float()).reshape(inside.shape) * inside
+        return mean_similarity(similarity, weight, size)
 
 
 class PlaneBlock(nn.Module):

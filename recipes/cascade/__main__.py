@@ -78,7 +78,7 @@ class Training:
             noise = torch.Generator().manual_seed(self.step)
             taps = tuple(tap + self.options.token_noise * torch.randn(tap.shape, generator=noise) for tap in taps)
         state = (encoding.context, encoding.context_fine, encoding.swept, encoding.origin)
-        depth, log_scale = self.net.decode(taps, *state)
+        depth, log_scale = self.net.head(taps, *state)
         loss, terms = objective(encoding, depth, log_scale, sample)
         if not torch.isfinite(loss):
             raise RuntimeError(f"the objective is {float(loss)} at step {self.step}: {terms}")

@@ -8,7 +8,7 @@ from torch.nn import functional as F
 
 from backends.cascade.network import PLANES, CascadeEncoding
 from backends.cascade.planes import Planes, baselines
-from backends.cascade.sweep import Stage
+from backends.sweep.network import Sweep
 from recipes.cascade.samples import Sample
 from recipes.sweep.objective import cell_inverse
 
@@ -94,7 +94,7 @@ def _gradient(error: Tensor, valid: Tensor) -> Tensor:
     return down.mean() + right.mean()
 
 
-def _cross_entropy(stage: Stage, t: Tensor, known: Tensor) -> Tensor:
+def _cross_entropy(stage: Sweep, t: Tensor, known: Tensor) -> Tensor:
     """Cross-entropy of the planes; the target ``t [V, 1, h, w]`` is split linearly between its two nearest planes."""
     count = stage.position.shape[1]
     spacing = stage.position[:, -1:] - stage.position[:, -2:-1]

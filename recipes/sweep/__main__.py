@@ -58,7 +58,7 @@ class SweepTraining(lightning.LightningModule):
         taps = encoding.taps
         if self.options.token_noise and self.global_step % 2:
             taps = tuple(tap + self.options.token_noise * torch.randn_like(tap) for tap in taps)
-        depth, log_scale = self.net.decode(taps, encoding.context, encoding.context_fine, encoding.swept)
+        depth, log_scale = self.net.head(taps, encoding.context, encoding.context_fine, encoding.swept)
         with full_precision(depth):
             loss, terms = objective(encoding, depth, log_scale, sample)
         if not torch.isfinite(loss):

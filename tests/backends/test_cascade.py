@@ -96,7 +96,7 @@ def test_shapes_and_gradients(make_scene, network: CascadeNet) -> None:
     """Every parameter gets a finite gradient, also with two views."""
     views = posed(make_scene, 2)
     encoding = encode(network, views)
-    depth, log_scale = network.decode(
+    depth, log_scale = network.head(
         encoding.taps, encoding.context, encoding.context_fine, encoding.swept, encoding.origin
     )
     assert depth.shape == log_scale.shape == (2, *SIZE)

@@ -13,8 +13,8 @@ from safetensors.torch import load_file
 from backends.cascade import CascadeBackend
 from backends.cascade.network import CascadeEncoding, CascadeNet
 from backends.cascade.planes import Planes, baselines
-from backends.cascade.sweep import Stage
 from backends.sweep.backend import SHIPPED
+from backends.sweep.network import Sweep
 from recipes.cascade.__main__ import STATE, WEIGHTS, Training
 from recipes.cascade.begin import begin
 from recipes.cascade.objective import objective
@@ -68,7 +68,7 @@ def slope() -> tuple[Sample, CascadeEncoding]:
         if cell < 8:
             position = t + position - position.mean()
         share = (1 - (position - t).abs() / spacing).clamp_min(1e-6)
-        stages.append(Stage(share.log(), position.expand(2, -1, -1, -1), t, torch.ones_like(t)))
+        stages.append(Sweep(share.log(), position.expand(2, -1, -1, -1), t, torch.ones_like(t)))
         centers.append(truth)
     nothing = torch.zeros(())
     swept = torch.cat((centers[2],) * 4, 1)
