@@ -28,13 +28,16 @@ SMALLEST_IMAGE = 2 ** (len(STAGES) - 1)
 EPSILON = 1e-10
 
 
-def psnr(predicted: Tensor, reference: Tensor) -> Tensor:
+def psnr(predicted: Tensor, reference: Tensor, weights: Tensor | None = None) -> Tensor:
     """Peak signal-to-noise ratio ``[...]`` in dB of images ``[..., 3, H, W]``, colours clamped to [0, 1].
 
-    Infinite for identical images.
+    Infinite for identical images. With pixel weights ``[..., H, W]``, the squared error is their weighted mean; NaN if
+    all are 0.
     """
-    difference = predicted.double().clamp(0, 1) - reference.double().clamp(0, 1)
-    return -10 * difference.square().mean((-3, -2, -1)).log10()
+    errors = (predicted.double().clamp(0, 1) - reference.double().clamp(0, 1)).square().mean(-3)
+    if weights is None:
+        return -10 * errors.mean((-2, -1)).log10()
+    return -10 * ((errors * weights).sum((-2, -1)) / weights.double().sum((-2, -1))).log10()
 
 
 def ssim(predicted: Tensor, reference: Tensor) -> Tensor:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor
 
 from vg2gt.data.transforms import resize_to_cover, to_bytes
 from vg2gt.geometry.cameras import crop_intrinsics, resize_intrinsics
@@ -46,19 +45,18 @@ def load_photographs(pictures: Sequence[Picture], cameras: Cameras, longest: int
     """
     size = full_size(pictures, cameras.size, longest)
     images = torch.empty(len(pictures), 3, *size, dtype=torch.uint8)
-    masks: list[Tensor | None] = []
+    masks = None
     intrinsics = torch.empty(len(pictures), 3, 3)
     with monitor.stage("load photographs", len(pictures)) as advance:
         for view, picture in enumerate(pictures):
             frame = resize_to_cover(picture.read(size), size)
             images[view] = to_bytes(frame.images[0])
-            masks.append(None if frame.mask is None else to_bytes(frame.mask[0]))
+            if frame.mask is not None:
+                masks = torch.full((len(pictures), *size), 255, dtype=torch.uint8) if masks is None else masks
+                masks[view] = to_bytes(frame.mask[0])
             own = photo_intrinsics(cameras.intrinsics[0, view].double().cpu(), cameras.size, picture.size)
             covering, (top, left) = covering_size(picture.size, size)
             own = resize_intrinsics(own, covering[1] / picture.size[1], covering[0] / picture.size[0])
             intrinsics[view] = crop_intrinsics(own, left, top).float()
             advance()
-    if all(mask is None for mask in masks):
-        return Photographs(images, intrinsics)
-    whole = torch.full(size, 255, dtype=torch.uint8)
-    return Photographs(images, intrinsics, torch.stack([whole if mask is None else mask for mask in masks]))
+    return Photographs(images, intrinsics, masks)

@@ -48,10 +48,10 @@ def refinement_for(
     check_choice("quality", quality, Quality)
     recorded = scene.camera_source is CameraSource.RECORDED
     name = "default" if recorded else {"normal": "photographs"}.get(quality, quality)
-    found = read_options(name, overrides)
+    predicted = scene.camera_source is CameraSource.PREDICTED and not _choose_config(overrides)
+    moved = [f"refine.rates.cameras={RefineRates().cameras}"] if predicted else []  # unless an override says otherwise
+    found = read_options(name, [*moved, *overrides])
     given: dict[str, Any] = {key: value for key, value in changes.items() if value is not None}
-    if not overrides and scene.camera_source is CameraSource.PREDICTED:
-        found = replace(found, rates=replace(found.rates, cameras=RefineRates().cameras))
     if not scene.pictures:  # only the working size can be refined
         found = replace(found, full=None)
     if "seconds" in given and found.full is None:
@@ -84,5 +84,9 @@ def chosen_refinement(
 
 def read_options(name: str, overrides: Sequence[str]) -> RefineOptions:
     """Builds the options of ``refine=NAME refine.key=value``; ``name`` is used if the overrides choose none."""
-    chosen = any(override.startswith("refine=") for override in overrides)
-    return instantiate(compose_groups(*([] if chosen else [f"refine={name}"]), *overrides).refine)
+    first = [] if _choose_config(overrides) else [f"refine={name}"]
+    return instantiate(compose_groups(*first, *overrides).refine)
+
+
+def _choose_config(overrides: Sequence[str]) -> bool:
+    return any(override.startswith("refine=") for override in overrides)

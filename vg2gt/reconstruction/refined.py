@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from vg2gt.reconstruction.scene import Scene
+
+log = logging.getLogger(__name__)
 
 USABLE = 17.0  # dB; scenes below it look like fog
 WORKING_SHARE = 0.45  # of the time, at most, for the stage at the working size
@@ -48,15 +51,22 @@ def refine_scene(
     at_working_size = options
     if full is not None and options.seconds is not None:
         at_working_size = replace(options, seconds=WORKING_SHARE * options.seconds)
-    fold = None if full is None else fold_of(split_views(len(scene.names), options.holdout)[0], full)
+    fold = None if full is None else fold_of(split_views(seen, options.holdout)[0], full)
     with monitor.stage("refine", 100, " %") as advance:
         observe = _shown(advance)
         refined = refine(scene.gaussians, scene.cameras, seen, scene.renderer, at_working_size, observe, clock, fold)
     if full is not None and refined.ended in ("steps", "seconds"):
-        photographs = load_photographs(scene.pictures, refined.scene.cameras, full.size, monitor).to(device)
-        left = None if options.seconds is None else max(0.0, options.seconds - (clock() - began))
-        with monitor.stage("refine at full size", 100, " %") as advance:
-            refined = sharpened(refined, photographs, seen, scene.renderer, options, left, _shown(advance), clock)
+        try:
+            photographs = load_photographs(scene.pictures, refined.scene.cameras, full.size, monitor).to(device)
+            left = None if options.seconds is None else options.seconds - (clock() - began)
+            if left is None or left > 0:
+                with monitor.stage("refine at full size", 100, " %") as advance:
+                    observe = _shown(advance)
+                    refined = sharpened(refined, photographs, seen, scene.renderer, options, left, observe, clock)
+            else:
+                log.warning("no time is left to refine at full size: allow more than %g seconds", options.seconds)
+        except KeyboardInterrupt:  # before or after its steps
+            refined = replace(refined, ended="interrupted")
     made = replace(
         scene,
         gaussians=refined.scene.gaussians,
@@ -97,8 +107,8 @@ def refinement_figures(scene: Scene) -> dict[str, Any]:
     if (sharp := refined.sharpened) is not None:
         height, width = sharp.scene.cameras.size
         figures["full_size"] = {"image": [height, width], "steps": sharp.steps, "ended": sharp.ended}
-        if sharp.scores:
-            figures["full_size"] |= {"psnr_left_out": round(sharp.scores[-1], 3), "left_out": list(sharp.fold)}
+        if sharp.score is not None:
+            figures["full_size"] |= {"psnr_left_out": round(sharp.score, 3), "left_out": list(sharp.fold)}
     for when, state, psnr in zip(("before", "after"), (refined.start, refined.scene), refined.psnr, strict=True):
         figures[f"gaussians_{when}"] = len(state.gaussians)
         for name, views in (("trained", refined.trained), ("held_out", refined.held_out)):
@@ -133,8 +143,8 @@ def refinement_lines(scene: Scene) -> list[str]:
         if len(views):
             before, after = (_mean(psnr[views]) for psnr in refined.psnr)
             lines.append(f"{name:<11} {len(views):>4} views: {before:6.2f} -> {after:6.2f} dB")
-    if (sharp := refined.sharpened) is not None and sharp.scores:
-        lines.append(_judged(sharp.scores[-1], len(sharp.fold)))
+    if (sharp := refined.sharpened) is not None and sharp.score is not None:
+        lines.append(_judged(sharp.score, len(sharp.fold)))
     before, after = len(refined.start.gaussians), len(refined.scene.gaussians)
     ended = {"interrupted": " (interrupted)", "diverged": " (stopped because it diverged)"}.get(refined.ended, "")
     kept = f"; the scene after step {refined.step} was the best and is kept" if refined.step < refined.steps else ""

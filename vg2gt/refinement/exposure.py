@@ -13,9 +13,7 @@ from vg2gt.types import Cameras, Gaussians
 
 DARKEST, BRIGHTEST = 0.05, 0.95  # pixels outside are clipped or noise
 COVERED = 0.5  # opacity of a pixel that shows a surface
-DIFFERENT = (
-    0.1  # standard deviation over the views: 0.02 to 0.06 on unaltered photographs, 0.3 with gains of 1/2 to 1.6
-)
+DIFFERENT = 0.1  # over the views, standard deviation: 0.02 to 0.06 on photographs, 0.3 with gains of 1/2 to 1.6
 RATE = 0.004
 
 

@@ -36,11 +36,11 @@ def footprints(means: Tensor, cameras: Cameras, near: float) -> Tensor:
     return found
 
 
-def in_front(gaussians_size: Tensor, means: Tensor, camera: Cameras, near: float) -> Tensor:
+def in_front(sizes: Tensor, means: Tensor, camera: Cameras, near: float) -> Tensor:
     """Returns the index ``[N]`` of the Gaussians that may be visible in one view.
 
     Args:
-        gaussians_size: ``[G]`` largest standard deviations.
+        sizes: ``[G]`` largest standard deviations.
         means: ``[G, 3]`` positions.
         camera: camera of the view (B = V = 1), such as one whose principal point is moved to a crop.
         near: near plane in scene units.
@@ -49,7 +49,7 @@ def in_front(gaussians_size: Tensor, means: Tensor, camera: Cameras, near: float
     slant = ((pixels - camera.intrinsics[0, 0, :2, 2]) / camera.intrinsics[0, 0, [0, 1], [0, 1]]).square().sum(-1)
     focal = camera.intrinsics[0, 0, [0, 1], [0, 1]].max()
     # the low-pass filter adds less than a pixel
-    radius = (REACH * focal * gaussians_size / depth.clamp(min=near) * (1 + slant).sqrt() + 2)[:, None]
+    radius = (REACH * focal * sizes / depth.clamp(min=near) * (1 + slant).sqrt() + 2)[:, None]
     size = pixels.new_tensor(camera.size[::-1])
     seen = ((pixels > -radius) & (pixels < size + radius)).all(-1) & (depth > near)
     return seen.nonzero()[:, 0]
@@ -72,7 +72,7 @@ def contributions(gaussians: Gaussians, cameras: Cameras, renderer: Renderer) ->
     small = replace(cameras, intrinsics=cameras.intrinsics * scale[:, None], size=(height, width))
     plain, largest = replace(renderer, geometry=False), torch.zeros_like(gaussians.opacities)
     for view in range(cameras.world_to_camera.shape[1]):
-        constant = gaussians.sh[:, :1].detach().clone().requires_grad_(True)
+        constant = torch.zeros_like(gaussians.sh[:, :1]).requires_grad_(True)  # grey: no colour is clamped at 0
         with torch.enable_grad():
             shown = plain(replace(gaussians.detach(), sh=constant), small.select(slice(view, view + 1)))
             shown.color[:, :, 0].sum().backward()
@@ -89,7 +89,7 @@ def remove_idle(parameters: Parameters, cameras: Cameras, renderer: Renderer, le
 
     Args:
         parameters: the scene, which is changed.
-        cameras: cameras of its views.
+        cameras: cameras of views (B = 1).
         renderer: its renderer.
         least: smallest contribution (:func:`contributions`).
     """
@@ -105,7 +105,7 @@ def split_large(parameters: Parameters, cameras: Cameras, near: float, pixels: f
 
     Args:
         parameters: the scene, which is changed.
-        cameras: cameras of its views at full size.
+        cameras: cameras of views at full size (B = 1).
         near: near plane in scene units.
         pixels: largest standard deviation in pixels that is not split.
         most: maximum number of Gaussians.

@@ -33,6 +33,12 @@ class Observations(TensorRecord):
     depth_conf: Tensor
     mask: Tensor | None = None
 
+    def shown(self) -> Tensor:
+        """Returns ``[V]`` bool, on the CPU: the views of which not all pixels are masked."""
+        if self.mask is None:
+            return torch.ones(len(self.images), dtype=torch.bool)
+        return (self.mask > 0).any(-1).any(-1).cpu()
+
     def views(self, views: Tensor) -> Observations:
         """Returns the observations of some views."""
         return self.map(lambda tensor: tensor[views])
@@ -268,6 +274,7 @@ class RefineOptions:
     full: FullSizeOptions | None = None
 
     def __post_init__(self) -> None:
+        colored = self.loss.color_l1 + self.loss.ssim > 0
         for name, good, expected in (
             ("steps", self.steps is None or self.steps >= 1, "at least 1, or null"),
             ("seconds", self.seconds is None or self.seconds > 0, "positive, or null"),
@@ -278,11 +285,8 @@ class RefineOptions:
             ("min_views", self.min_views >= 0, "at least 0"),
             ("merge_cells", self.merge_cells >= 0, "at least 0"),
             ("geometry_every", self.geometry_every >= 1, "at least 1"),
-            (
-                "geometry_every",
-                self.geometry_every <= 1 or self.loss.color_l1 + self.loss.ssim > 0,
-                "1 without a colour term, as colour compares the states",
-            ),
+            ("geometry_every", colored or self.geometry_every == 1, "1 without a term of colour, which compares states"),
+            ("full", colored or self.full is None, "null without a term of colour, which most of its steps need"),
         ):
             if not good:
                 raise ValueError(f"refine.{name} must be {expected}, got {getattr(self, name)}")

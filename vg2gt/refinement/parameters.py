@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -69,7 +70,7 @@ class Parameters:
         pixel: size of a pixel at the scene's median depth relative to that depth: the unit of rotations and, times
             ``depth``, of shifts.
         depth: median depth in scene units.
-        trained: ``[N]`` views to train on; exposures of the others stay fixed.
+        trained: ``[N]`` views whose exposures are 1 in the mean, since the scene's colours represent it.
 
     Attributes:
         values: the parameters by name; those of Gaussians have one row each.
@@ -81,7 +82,7 @@ class Parameters:
     def __init__(self, start: RefinedScene, rates: RefineRates, pixel: float, depth: float, trained: Tensor) -> None:
         gaussians = start.gaussians
         self.start = start
-        self.pixel, self.depth, self.trained = pixel, depth, trained
+        self.pixel, self.depth, self.trained = pixel, depth, trained.to(gaussians.means.device)
         self.unit = gaussians.scales.median(-1).values
         self.size = gaussians.scales.max(-1).values
         self.values = {
@@ -124,17 +125,24 @@ class Parameters:
             start.gaussians.background,
         )
         gain, bias = self._centred(values["gain"]).exp(), self._centred(values["bias"])
-        return RefinedScene(gaussians, self._cameras(start.cameras), gain, bias)
+        return RefinedScene(gaussians, self._moved(values["cameras"]), gain, bias)
+
+    @property
+    def cameras(self) -> Cameras:
+        """The current cameras, without autograd graph."""
+        return self._moved(self.values["cameras"])
 
     def _centred(self, exposure: Tensor) -> Tensor:
-        """Returns exposures ``[V, 3]`` minus the mean of the trained views, which the scene's colours represent."""
+        """Returns exposures ``[V, 3]`` minus the mean of the trained views."""
         trained = exposure[self.trained]
         return exposure.index_copy(0, self.trained, trained - trained.mean(0))
 
-    def _cameras(self, cameras: Cameras) -> Cameras:
+    def _moved(self, moves: Tensor) -> Cameras:
+        """Returns the initial cameras after rotations and shifts ``[V, 6]``."""
+        cameras = self.start.cameras
         if not self.rates["cameras"]:
             return cameras
-        moves = self.pixel * self._leaves["cameras"]
+        moves = self.pixel * moves
         turn = quat_to_matrix(F.pad(moves[:, :3] / 2, (1, 0), value=1.0))
         top = torch.cat((turn, self.depth * moves[:, 3:, None]), -1)
         increment = torch.cat((top, cameras.world_to_camera[0, :, 3:]), -2)
@@ -206,10 +214,10 @@ class Parameters:
         turn = quat_to_matrix(F.normalize(self.values["quats"][rows], dim=-1))
         picked = torch.arange(len(rows), device=rows.device)
         shift = offset * turn[picked, :, axis] * scales[picked, axis][:, None]
-        self.values["scales"][rows, axis] += torch.tensor(shrink, device=rows.device).log()
-        self.values["means"][rows] += shift
+        self.values["scales"][rows, axis] += math.log(shrink)
         self._replace(lambda values: torch.cat((values, values[rows])))
-        self.values["means"][-len(rows) :] -= 2 * shift
+        self.values["means"][rows] += shift
+        self.values["means"][-len(rows) :] -= shift
         self._measure()
 
     def _measure(self) -> None:
@@ -222,8 +230,8 @@ class Parameters:
 
     def _replace(self, change: Callable[[Tensor], Tensor]) -> None:
         """Applies a change of rows to all that is known of the Gaussians."""
-        self.unit, self.size, self.counts = (change(each) for each in (self.unit, self.size, self.counts))
-        for name in OF_GAUSSIANS:
-            self.values[name] = change(self.values[name])
-            first, second = self.moments[name]
-            self.moments[name] = (change(first), change(second))
+        unit, size, counts = change(self.unit), change(self.size), change(self.counts)
+        values = self.values | {name: change(self.values[name]) for name in OF_GAUSSIANS}
+        moments = self.moments | {name: (change(a), change(b)) for name in OF_GAUSSIANS for a, b in [self.moments[name]]}
+        # at once, because Ctrl-C during the copies must leave a scene that fits together
+        self.unit, self.size, self.counts, self.values, self.moments = unit, size, counts, values, moments

@@ -32,6 +32,16 @@ class Photographs(TensorRecord):
         """Height and width in pixels."""
         return (self.images.shape[-2], self.images.shape[-1])
 
+    def bounds(self, view: int) -> list[tuple[int, int]]:
+        """Returns first row and row after the last, then first column and column after the last, that are not masked.
+
+        The whole image if all pixels are masked.
+        """
+        if self.mask is None or not self.mask[view].any():
+            return [(0, side) for side in self.size]
+        used = (self.mask[view].any(axis).nonzero() for axis in (1, 0))
+        return [(int(found[0]), int(found[-1]) + 1) for found in used]
+
     def halved(self) -> Photographs:
         """Returns the photographs at half the size, each pixel the mean of four; an odd last row or column is lost."""
 
@@ -98,16 +108,19 @@ class Crop:
 class CropOrder:
     """Deals crops of random views: each view once before any repeats, each pixel of a view about equally often.
 
+    Crops of masked photographs keep to the rectangle around what is not masked.
+
     Args:
-        size: height and width of the photographs.
+        photographs: the photographs.
         side: longest side of a crop in pixels.
         views: ``[N]`` views to deal.
         seed: random seed.
     """
 
-    def __init__(self, size: tuple[int, int], side: int, views: Tensor, seed: int) -> None:
-        self.size, self.views = size, views
-        self.crop = (min(side, size[0]), min(side, size[1]))
+    def __init__(self, photographs: Photographs, side: int, views: Tensor, seed: int) -> None:
+        self.size, self.views = photographs.size, views
+        self.crop = (min(side, self.size[0]), min(side, self.size[1]))
+        self._bounds = {view: photographs.bounds(view) for view in views.tolist()}
         self._generator = torch.Generator().manual_seed(seed)
         self._hand: list[int] = []
 
@@ -116,14 +129,14 @@ class CropOrder:
         if not self._hand:
             order = torch.randperm(len(self.views), generator=self._generator)
             self._hand = self.views[order].tolist()
-        top, left = (self._start(whole, part) for whole, part in zip(self.size, self.crop, strict=True))
-        return Crop(self._hand.pop(), top, left, self.crop)
+        view = self._hand.pop()
+        top, left = map(self._start, self.size, self.crop, self._bounds[view])
+        return Crop(view, top, left, self.crop)
 
-    def _start(self, whole: int, part: int) -> int:
-        """Returns the first pixel of a crop along one axis; positions beyond the border are moved to it."""
-        room = whole - part
-        drawn = float(torch.rand((), generator=self._generator)) * (room + part) - part / 2
-        return min(max(round(drawn), 0), room)
+    def _start(self, whole: int, part: int, bounds: tuple[int, int]) -> int:
+        """Returns the first pixel of a crop along one axis, whose middle is drawn; the border moves it inside."""
+        middle = bounds[0] + float(torch.rand((), generator=self._generator)) * (bounds[1] - bounds[0])
+        return min(max(round(middle - part / 2), 0), whole - part)
 
 
 def whole_views(photographs: Photographs, views: Tensor) -> list[Crop]:

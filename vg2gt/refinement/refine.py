@@ -42,9 +42,9 @@ class Refined:
         steps: number of steps made.
         seconds: elapsed on the refinement's clock.
         ended: ``steps``, ``seconds``, ``interrupted`` or ``diverged``.
-        psnr: ``[2, V]`` PSNR of every view before and after, in dB.
+        psnr: ``[2, V]`` PSNR of every view before and after, in dB, over the pixels that are not masked.
         trained: ``[N]`` views that were trained on.
-        held_out: ``[V - N]`` the other views.
+        held_out: the other views, without those that are masked as a whole.
         sharpened: result of the stage at full size; None if there was none. Its steps are among ``steps``.
     """
 
@@ -72,8 +72,11 @@ def sharpened(
 ) -> Refined:
     """Continues a refinement on the photographs at their own size; arguments as for :func:`sharpen`."""
     began = clock()
-    trained, _ = split_views(len(seen.images), options.holdout)
+    trained, held_out = split_views(seen, options.holdout)
     sharp = sharpen(refined.scene, photographs, seen, renderer, options, seconds, trained, observe, clock)
+    steps = refined.steps + sharp.steps
+    if sharp.ended == "no gain":
+        return replace(refined, steps=steps, seconds=refined.seconds + clock() - began, sharpened=sharp)
     poses = replace(refined.scene.cameras, world_to_camera=sharp.scene.cameras.world_to_camera)
     scene = replace(sharp.scene, cameras=poses)
     if options.rates.cameras:
@@ -82,12 +85,13 @@ def sharpened(
     return replace(
         refined,
         scene=scene,
-        steps=refined.steps + sharp.steps,
-        step=refined.steps + sharp.steps,
+        steps=steps,
+        step=steps,
         seconds=refined.seconds + clock() - began,
-        ended="steps" if sharp.ended in ("overfitting", "no gain") else sharp.ended,
+        ended="steps" if sharp.ended == "overfitting" else sharp.ended,
         psnr=torch.stack((refined.psnr[0], after)),
         trained=trained,
+        held_out=held_out,
         sharpened=sharp,
     )
 
@@ -107,10 +111,10 @@ def view_loss(
     """Returns the loss of some views, and their PSNR ``[R]``; ``unit``: median depth of the scene."""
     cameras, seen = scene.cameras.select(views), seen.views(views)
     rendered = replace(renderer, geometry=loss.needs_geometry)(scene.gaussians, cameras)
-    color = where_it_counts(scene.exposed(rendered.color, views)[0], seen.images, seen.mask)
-    rendered = replace(rendered, color=color[None])
-    terms = loss.of_views(rendered, cameras, seen, unit)
-    return loss.total(terms), psnr(rendered.color[0].detach(), seen.images)
+    color = scene.exposed(rendered.color, views)
+    counted = replace(rendered, color=where_it_counts(color[0], seen.images, seen.mask)[None])
+    terms = loss.of_views(counted, cameras, seen, unit)
+    return loss.total(terms), psnr(color[0].detach(), seen.images, seen.mask)
 
 
 def refine(
@@ -151,6 +155,8 @@ def refine(
         )
     if not len(gaussians):
         raise ValueError("there are no Gaussians to refine")
+    if not seen.shown().any():
+        raise ValueError("the masks of all views hide every pixel: there is nothing to refine on; check the masks")
     with torch.enable_grad():
         return _Refinement(gaussians, cameras, seen, renderer, options, clock, fold).run(observe)
 
@@ -168,9 +174,9 @@ class _Refinement:
     ) -> None:
         self.seen, self.renderer, self.clock = seen, renderer, clock
         self.began = clock()
-        self.order = ViewOrder(len(seen.images), options.holdout, options.seed, fold)
-        self.trained = self.order.trained.to(seen.images.device)
-        self.options = options.of(len(self.order.trained))
+        self.trained, self.held_out = split_views(seen, options.holdout, fold)
+        self.order = ViewOrder(self.trained, options.seed)
+        self.options = options.of(len(self.trained))
         loss = self.options.loss
         self.scoring = loss if self.options.geometry_every == 1 else loss.with_geometry(0)  # renders twice as fast
         start = gaussians
@@ -210,7 +216,7 @@ class _Refinement:
         except KeyboardInterrupt:
             ended = "interrupted"
         loss, after = self._score(self.best, torch.arange(len(self.seen.images)))
-        trained = self.order.trained
+        trained = self.trained
         if not loss[trained].mean() <= self.start_loss[trained].mean():  # left-out views can improve by chance
             self.best, self.best_step, loss, after = self.start, 0, self.start_loss, self.start_psnr
         closer = after[trained].mean() > self.given_psnr[trained].mean()
@@ -227,8 +233,8 @@ class _Refinement:
             seconds=self.clock() - self.began,
             ended=ended,
             psnr=torch.stack((self.given_psnr, after)),
-            trained=self.order.trained,
-            held_out=self.order.held_out,
+            trained=trained,
+            held_out=self.held_out,
         )
 
     def _done(self) -> float:
@@ -265,7 +271,7 @@ class _Refinement:
     def _check(self) -> str:
         """Scores the current state and keeps it if it is the best; returns what is wrong if it diverges."""
         scene = self.parameters.scene().detach()
-        views = self.order.left_out if len(self.order.left_out) else self.order.trained
+        views = self.order.left_out if len(self.order.left_out) else self.trained
         loss, _ = self._score(scene, views)
         score = float((loss / self.start_loss[views]).mean())
         if not math.isfinite(score):
@@ -285,31 +291,34 @@ class _Refinement:
         return "diverged"
 
 
-def split_views(views: int, holdout: int | None) -> tuple[Tensor, Tensor]:
-    """Returns the indices of the views to train on, and of every N-th one, which is not; None: train on all."""
-    every = torch.arange(views)
-    last = torch.zeros(views, dtype=torch.bool) if holdout is None else every % holdout == holdout - 1
-    return every[~last], every[last]
+def split_views(seen: Observations, holdout: int | None, fold: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Returns the indices of the views to train on, and of the others; views that are masked as a whole are neither.
+
+    Args:
+        seen: observations of V views.
+        holdout: do not train on every N-th view; None: train on all.
+        fold: ``[F]`` further views not to train on; None: none.
+    """
+    every, shown = torch.arange(len(seen.images)), seen.shown()
+    others = torch.zeros_like(shown) if holdout is None else every % holdout == holdout - 1
+    if fold is not None:
+        others |= torch.isin(every, fold)
+    return every[shown & ~others], every[shown & others]
 
 
 class ViewOrder:
     """Deals views in random order, each once before any repeats; some are left out, in rotation.
 
     Args:
-        views: number of views.
-        holdout: never deal every N-th view; None: deal all.
+        trained: ``[N]`` views to deal.
         seed: random seed of the order.
-        fold: further views that are not dealt; None: none.
 
     Attributes:
-        trained: ``[N]`` views that are dealt.
-        held_out: ``[V - N]`` views that are never dealt, without the fold.
+        left_out: views that are not dealt at present.
     """
 
-    def __init__(self, views: int, holdout: int | None, seed: int, fold: Tensor | None = None) -> None:
-        self.trained, self.held_out = split_views(views, holdout)
-        if fold is not None:
-            self.trained = self.trained[~torch.isin(self.trained, fold)]
+    def __init__(self, trained: Tensor, seed: int) -> None:
+        self.trained = trained
         self._generator = torch.Generator().manual_seed(seed)
         self._left_out = self._rotation()
         self._hand: list[int] = []

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from vg2gt.losses.gaussian import where_it_counts
 from vg2gt.metrics import psnr
+from vg2gt.refinement.exposure import log_exposures
 from vg2gt.refinement.growth import in_front, remove_idle, split_large
 from vg2gt.refinement.options import FullSizeOptions, Observations, RefineLoss, RefineOptions
 from vg2gt.refinement.parameters import Parameters, RefinedScene
@@ -42,7 +43,7 @@ class Sharpened:
         ended: ``steps``, ``seconds``, ``interrupted``, ``diverged``, ``overfitting`` (left-out views became worse, and
             the stage ended early) or ``no gain`` (it made them worse from the start, and ``scene`` is the start).
         fold: left-out views.
-        scores: PSNR of the left-out views in dB, before and while they were left out.
+        scores: PSNR of the left-out views in dB, before and while they were left out, over pixels that are not masked.
         growth: number of Gaussians that were split.
         renderer: renderer that the scene was fitted with; scenes of large photographs are ``antialiased``.
     """
@@ -54,6 +55,13 @@ class Sharpened:
     scores: tuple[float, ...]
     growth: int
     renderer: Renderer
+
+    @property
+    def score(self) -> float | None:
+        """PSNR of the left-out views in ``scene`` or, if they were trained at the end, before; None: none left out."""
+        if not self.scores:
+            return None
+        return self.scores[0 if self.ended == "no gain" else -1]
 
 
 def sharpen(
@@ -77,14 +85,14 @@ def sharpen(
         seen: observations of the views at the working size, for the terms of depth and normals.
         renderer: renderer of the scene.
         options: options; ``options.full`` must not be None.
-        seconds: maximum time; None: until ``options.full.steps`` are made.
-        trained: ``[N]`` views to train on; None: all.
+        seconds: maximum time, > 0; None: until ``options.full.steps`` are made.
+        trained: ``[N]`` views to train on; None: all that are not masked as a whole.
         observe: called after every step with the number of steps, the share of the stage that is done, and the mean
-            PSNR of the last 20 steps in dB.
+            PSNR in dB of the last 20 crops that were not masked as a whole; 0: there was none.
         clock: returns the time in seconds.
     """
     if trained is None:
-        trained = torch.arange(len(photographs.images))
+        trained = seen.shown().nonzero()[:, 0]
     with torch.enable_grad():
         return _Sharpening(start, photographs, seen, renderer, options, seconds, trained, clock).run(observe)
 
@@ -109,8 +117,8 @@ class _Sharpening:
         # rendered smaller than it was fitted, a scene of small Gaussians is right only with compensated opacities;
         # what was fitted at the working size is too small for them there, but not at much larger sizes
         self.given, self.renderer = renderer, replace(renderer, antialiased=True) if large else renderer
-        self.intrinsics = start.cameras.intrinsics[0]
-        self.start = replace(start, cameras=self.photographs.cameras(start.cameras)).detach()
+        self.poses = start.cameras
+        start = replace(start, cameras=self.photographs.cameras(start.cameras)).detach()
         self.clock, self.began, self.seconds = clock, clock(), seconds
         self.views = trained
         self.fold = fold_of(trained, self.full)
@@ -119,7 +127,8 @@ class _Sharpening:
         focal = float(photographs.intrinsics[:, [0, 1], [0, 1]].mean())
         rates = options.rates
         rates = replace(rates, means=self.full.rate * rates.means, sh=self.full.rate * rates.sh)
-        self.parameters = Parameters(self.start, rates, 1 / focal, self.depth, trained)
+        self.early = trained[~torch.isin(trained, self.fold)]
+        self.parameters = Parameters(start, rates, 1 / focal, self.depth, self.early)
         self.limit = _most_steps(self.full, photographs, len(trained), seconds)
         self.open = not len(self.fold)
         self.order = self._order()
@@ -131,18 +140,18 @@ class _Sharpening:
     def run(self, observe: Callable[[int, float, float], None] | None) -> Sharpened:
         """Runs steps, growth and checks until the stage ends."""
         ended = ""
-        self._grow(twice=True)
-        if not self.open:
-            self.scores.append(self._score())
         try:
+            self._grow(twice=True)
+            if not self.open:
+                self.scores.append(self._score())
             while not ended:
                 ended = self._step()
                 if observe is not None:
-                    observe(self.steps, self._done(), sum(self.recent) / len(self.recent))
+                    observe(self.steps, self._done(), sum(self.recent) / max(1, len(self.recent)))
         except KeyboardInterrupt:
             ended = "interrupted"
         useless = ended == "no gain"
-        scene = self.start if useless else self.parameters.scene().detach()
+        scene = self.parameters.start if useless else self.parameters.scene().detach()
         scene = replace(scene, cameras=self.whole.cameras(scene.cameras))
         return Sharpened(
             scene=scene,
@@ -163,8 +172,8 @@ class _Sharpening:
         return min(1.0, self._raw() / self.stretch)
 
     def _order(self) -> CropOrder:
-        views = self.views if self.open else self.views[~torch.isin(self.views, self.fold)]
-        return CropOrder(self.photographs.size, self.full.crop, views, self.options.seed)
+        views = self.views if self.open else self.early
+        return CropOrder(self.photographs, self.full.crop, views, self.options.seed)
 
     def _step(self) -> str:
         """Runs one step and what is due after it; returns how the stage ended, or an empty string."""
@@ -176,7 +185,7 @@ class _Sharpening:
         rendered, image = self._terms(scene, crop, of_step)
         if terms := of_step.of_gaussians(scene.gaussians, self.parameters.size[rows]):
             rendered = rendered + of_step.total(terms)
-        self.recent = [*self.recent, image][-20:]
+        self.recent = [*self.recent, *([image] if math.isfinite(image) else [])][-20:]
         self.steps += 1
         if not self.parameters.step(rendered, FINAL_RATE ** self._done()):
             log.warning("refinement at full size, step %d: the loss or its gradient is not finite", self.steps)
@@ -196,27 +205,38 @@ class _Sharpening:
         """Returns the Gaussians that a crop may show."""
         values = self.parameters.values
         size = values["scales"].max(-1).values.exp()
-        return in_front(size, values["means"], crop.camera(self.start.cameras), self.renderer.near)
+        return in_front(size, values["means"], crop.camera(self.parameters.cameras), self.renderer.near)
 
     def _terms(self, scene: RefinedScene, crop: Crop, loss: RefineLoss) -> tuple[Tensor, float]:
-        """Returns the loss of one crop, and its PSNR in dB."""
+        """Returns the loss of one crop, and its PSNR in dB; NaN if it is masked as a whole."""
         camera = crop.camera(scene.cameras)
-        seen = crop.observations(self.photographs, self.seen, self.intrinsics)
+        seen = crop.observations(self.photographs, self.seen, self.poses.intrinsics[0])
         view = torch.tensor([crop.view], device=seen.images.device)
         rendered = replace(self.renderer, geometry=loss.needs_geometry)(scene.gaussians, camera)
-        color = where_it_counts(scene.exposed(rendered.color, view)[0], seen.images, seen.mask)
-        terms = loss.of_views(replace(rendered, color=color[None]), camera, seen, self.depth)
-        return loss.total(terms), float(psnr(color.detach(), seen.images).mean())
+        color = scene.exposed(rendered.color, view)
+        counted = where_it_counts(color[0], seen.images, seen.mask)
+        terms = loss.of_views(replace(rendered, color=counted[None]), camera, seen, self.depth)
+        return loss.total(terms), float(psnr(color[0].detach(), seen.images, seen.mask))
 
     def _enlarge(self) -> None:
         """Goes on from half to full size."""
-        self.photographs = self.whole
-        self.start = replace(self.start, cameras=self.whole.cameras(self.start.cameras))
-        self.parameters.start = self.start
+        self.photographs, start = self.whole, self.parameters.start
+        self.parameters.start = replace(start, cameras=self.whole.cameras(start.cameras))
         self.order = self._order()
 
+    def _open(self) -> None:
+        """Trains all views from now on; the exposures of those left out so far start as the scene suggests."""
+        self.open = True
+        self.order = self._order()
+        if self.parameters.rates["gain"]:
+            scene, fold = self.parameters.scene().detach(), self.fold.to(self.seen.images.device)
+            cameras = replace(self.poses, world_to_camera=scene.cameras.world_to_camera).select(fold)
+            found = log_exposures(scene.gaussians, cameras, self.seen.views(fold), self.renderer)
+            self.parameters.values["gain"][fold] = found
+
     def _grow(self, twice: bool = False) -> None:
-        cameras = self.whole.cameras(self.start.cameras)
+        views = self.views.to(self.seen.images.device)
+        cameras = self.whole.cameras(self.parameters.cameras).select(views)
         remove_idle(self.parameters, cameras, self.renderer, self.full.least)
         for factor in (1.5, 1.5) if twice else (1.0,):
             pixels = factor * self.full.footprint
@@ -230,10 +250,10 @@ class _Sharpening:
         plain, total = replace(self.renderer, geometry=False), 0.0
         for crop in whole_views(self.whole, self.fold):
             color = plain(scene.gaussians, crop.camera(scene.cameras)).color[0]
-            seen = crop.observations(self.whole, self.seen, self.intrinsics)
+            seen = crop.observations(self.whole, self.seen, self.poses.intrinsics[0])
             if self.parameters.rates["gain"]:
-                color = matched(color, seen.images)  # nothing else knows the exposure of a left-out view
-            total += float(psnr(where_it_counts(color, seen.images, seen.mask), seen.images).mean())
+                color = matched(color, seen.images, seen.mask)  # nothing else knows the exposure of a left-out view
+            total += float(psnr(color, seen.images, seen.mask))
         return total / len(self.fold)
 
     def _watch(self, done: float) -> str:
@@ -249,17 +269,26 @@ class _Sharpening:
         if worse:
             self.stretch = self._raw() / self.full.opened
         if worse or done >= self.full.opened:
-            self.open = True
-            self.order = self._order()
+            self._open()
         return ""
 
 
-def matched(color: Tensor, images: Tensor) -> Tensor:
-    """Returns colours ``[R, 3, H, W]`` with the gain and bias of each channel that fit the images best."""
-    means = color.mean((2, 3), keepdim=True), images.mean((2, 3), keepdim=True)
-    centred = color - means[0]
-    gain = (centred * (images - means[1])).sum((2, 3), keepdim=True) / centred.square().sum((2, 3), keepdim=True)
-    return gain.nan_to_num(1.0) * centred + means[1]
+def matched(color: Tensor, images: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Returns colours ``[R, 3, H, W]`` with the gain and bias of each channel that fit the images best.
+
+    Args:
+        color: rendered colours.
+        images: images of the same views.
+        mask: ``[R, H, W]`` weights of the pixels; None: all 1.
+    """
+    weights = torch.ones_like(color[:, :1]) if mask is None else mask[:, None]
+
+    def mean(values: Tensor) -> Tensor:
+        return (weights * values).sum((2, 3), keepdim=True) / weights.sum((2, 3), keepdim=True)
+
+    centred, middle = color - mean(color), mean(images)
+    gain = mean(centred * (images - middle)) / mean(centred.square())
+    return gain.nan_to_num(1.0) * centred + middle
 
 
 def fold_of(views: Tensor, options: FullSizeOptions) -> Tensor:
