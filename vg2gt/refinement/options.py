@@ -285,7 +285,7 @@ class RefineOptions:
             ("min_views", self.min_views >= 0, "at least 0"),
             ("merge_cells", self.merge_cells >= 0, "at least 0"),
             ("geometry_every", self.geometry_every >= 1, "at least 1"),
-            ("geometry_every", colored or self.geometry_every == 1, "1 without a term of colour, which compares states"),
+            ("geometry_every", colored or self.geometry_every == 1, "1 without a term of colour, which scores states"),
             ("full", colored or self.full is None, "null without a term of colour, which most of its steps need"),
         ):
             if not good:

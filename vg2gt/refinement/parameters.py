@@ -232,6 +232,6 @@ class Parameters:
         """Applies a change of rows to all that is known of the Gaussians."""
         unit, size, counts = change(self.unit), change(self.size), change(self.counts)
         values = self.values | {name: change(self.values[name]) for name in OF_GAUSSIANS}
-        moments = self.moments | {name: (change(a), change(b)) for name in OF_GAUSSIANS for a, b in [self.moments[name]]}
+        moments = self.moments | {name: tuple(map(change, self.moments[name])) for name in OF_GAUSSIANS}
         # at once, because Ctrl-C during the copies must leave a scene that fits together
         self.unit, self.size, self.counts, self.values, self.moments = unit, size, counts, values, moments

@@ -17,10 +17,8 @@ from vg2gt.geometry.cameras import project, unproject
 from vg2gt.types import Cameras
 
 _MARGIN = 2  # pixels around a mask that count as inside
-_EMPTY, _UNSURE = (
-    0.3,
-    0.6,
-)  # share of the hidden area behind which other views see points: of clean and of rough cut-outs
+# share of the hidden area behind which other views see points: of clean and of rough cut-outs
+_EMPTY, _UNSURE = 0.3, 0.6
 _RARE, _MOST = 0.05, 0.5  # share of a point's views that see it outside, if it is wrong: of clean and of rough cut-outs
 _CELLS = 24  # across the longer side of an image, in which the hidden area is counted
 _POINTS = 40_000  # points that are projected to count it
@@ -89,9 +87,8 @@ def outside_hull(points: Tensor, cameras: Cameras, mask: Tensor, share: float) -
     """
     count = torch.zeros(2, len(points), device=points.device)  # views that see a point, and that see it outside
     for view in range(len(mask)):
-        inside = F.max_pool2d((mask[view] > 0.5).float()[None, None], 2 * _MARGIN + 1, 1, _MARGIN)[0, 0].to(
-            points.device
-        )
+        wider = F.max_pool2d((mask[view] > 0.5).float()[None, None], 2 * _MARGIN + 1, 1, _MARGIN)
+        inside = wider[0, 0].to(points.device)
         x, y, seen = _pixels(points, cameras.select(slice(view, view + 1)))
         count[0] += seen
         count[1, seen] += 1 - inside[y[seen], x[seen]]
