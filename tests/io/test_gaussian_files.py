@@ -37,6 +37,10 @@ def test_round_trip_within_the_stated_losses(tmp_path: Path, degree: int) -> Non
     sign = (units[0] * units[1]).sum(-1, keepdim=True).sign()
     assert (units[0] - sign * units[1]).abs().max() <= 1 / 350
     assert write_spz(tmp_path / "again.spz", before).read_bytes() == path.read_bytes()  # nothing of the time or name
+    flagged = write_spz(tmp_path / "flagged.spz", before, antialiased=True)
+    plain, said = (gzip.decompress(each.read_bytes()) for each in (path, flagged))
+    assert (plain[14], said[14]) == (0, 1)  # the format's flag byte
+    assert plain[:14] + plain[15:] == said[:14] + said[15:]
 
 
 def test_scenes_of_nothing_and_of_one_and_small_files(tmp_path: Path) -> None:

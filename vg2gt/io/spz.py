@@ -30,11 +30,18 @@ _HEADER = struct.Struct("<4sIIBBBB")
 _MAGIC = b"NGSP"
 _DEGREES = {1: 0, 4: 1, 9: 2, 16: 3}  # by number of coefficients
 _MOST_BITS = 20  # fractional bits of a position
+_ANTIALIASED = 1  # flag of a scene whose opacities a viewer has to compensate for its low-pass filter
 _COLOR = 0.15  # a byte holds 0.5 + 0.15 times the constant coefficient
 
 
-def write_spz(path: str | Path, gaussians: Gaussians) -> Path:
+def write_spz(path: str | Path, gaussians: Gaussians, antialiased: bool = False) -> Path:
     """Writes one scene's Gaussians in order, as version 3, atomically; the module lists the losses.
+
+    Args:
+        path: file to write.
+        gaussians: the scene.
+        antialiased: whether the scene was fitted with opacities compensated for the low-pass filter
+            (:class:`vg2gt.rendering.RenderOptions`); the file's flag says so to viewers.
 
     Raises:
         ValueError: if there is more than one scene or a value cannot be written.
@@ -55,7 +62,7 @@ def write_spz(path: str | Path, gaussians: Gaussians) -> Path:
         _packed(np.roll(arrays.quats, -1, 1)),
         _bytes(arrays.sh[:, 1:] * 128 + 128),
     )
-    head = _HEADER.pack(_MAGIC, 3, len(fixed), _DEGREES[arrays.sh.shape[1]], bits, 0, 0)
+    head = _HEADER.pack(_MAGIC, 3, len(fixed), _DEGREES[arrays.sh.shape[1]], bits, _ANTIALIASED * antialiased, 0)
     return write_bytes(path, gzip.compress(head + b"".join(column.tobytes() for column in columns), mtime=0))
 
 

@@ -345,7 +345,7 @@ def _target(output: str) -> str:
 
 _WRITERS: dict[str, Callable[[Scene, Path], Any]] = {
     "scene.ply": _scene_ply,
-    "scene.spz": lambda scene, path: write_spz(path, scene.gaussians),
+    "scene.spz": lambda scene, path: write_spz(path, scene.gaussians, scene.renderer.antialiased),
     "scene.html": _page,
     "tiles": _tiles,
     "cameras.json": lambda scene, path: write_cameras_json(path, scene.named_cameras()),
