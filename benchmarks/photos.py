@@ -37,6 +37,7 @@ from vg2gt.reconstruction.pipeline import reconstruct_with
 from vg2gt.reconstruction.refined import refine_scene
 from vg2gt.reconstruction.scene import Scene
 from vg2gt.refinement import RefineOptions
+from vg2gt.refinement.sharpen import matched
 from vg2gt.rendering import Renderer
 from vg2gt.runs.load import LoadedModel, load_model
 from vg2gt.types import Cameras, Gaussians
@@ -85,6 +86,8 @@ class Scores:
             row[f"psnr{suffix}"] = float(psnr(rendered, truth).mean())
             row[f"ssim{suffix}"] = float(ssim(rendered, truth).mean())
             row[f"detail{suffix}"] = float(_detail(rendered) / _detail(truth))
+        # after a gain and bias for each view and channel: the exposure of a held-out photograph is unknown
+        row["psnr_fitted"] = float(psnr(matched(rendered, truth), truth).mean())
         if self.lpips is not None:
             row["lpips"] = float(self.lpips(rendered, truth).mean())
         self.panels[label] = [rendered[views.index(view)] for view in self._pictured()]
@@ -217,6 +220,7 @@ def tables(rows: Sequence[Row]) -> str:
     shown = columns("psnr", "ssim", "lpips", "gaussians", decimals={"psnr": 2})
     for name in ("psnr", "ssim"):
         shown[f"{name}_given"] = replace(METRICS[name], label=f"{METRICS[name].label}, given")
+    shown["psnr_fitted"] = replace(METRICS["psnr"], label="PSNR, exposure fitted")
     shown["detail"] = Metric("detail", 2)
     shown |= {"steps": Metric("steps", 0), "core_seconds": Metric("core-s", 0), "peak_memory_mb": Metric("MB", 0)}
     cells = [
@@ -240,7 +244,7 @@ def arguments() -> argparse.Namespace:
     """Parses the command line."""
     options = parser(__doc__)
     options.add_argument("folders", nargs="+", metavar="FOLDER", help="folder of photographs, or NAME=FOLDER")
-    options.add_argument("--size", type=int, default=280, help="longer side in pixels")
+    options.add_argument("--size", type=int, default=280, help="longer side in pixels, such as 280, 1008 or 1600")
     options.add_argument("--working-size", type=int, help="longer side that VG²GT works at; scored at --size")
     options.add_argument("--budgets", type=float, nargs="*", default=[30.0, 100.0, 300.0], metavar="CORE_SECONDS")
     options.add_argument("--poses", choices=("sfm", "given"), default="sfm")

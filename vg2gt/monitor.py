@@ -27,14 +27,18 @@ class Monitor:
     Args:
         show: draw progress bars on the standard error stream.
         device: device to synchronise with and to measure the memory of.
+        watch: called after every step of a refinement with a function that returns the current scene; None: nobody
+            watches (:class:`vg2gt.viewer.live.LiveView`).
 
     Attributes:
         seconds: wall time by stage, in the order of their first start. Repeated stages add up; the time of a nested
             stage counts for the inner stage only.
     """
 
-    def __init__(self, show: bool = False, device: torch.device | str = "cpu") -> None:
-        self.device = torch.device(device)
+    def __init__(
+        self, show: bool = False, device: torch.device | str = "cpu", watch: Callable[..., None] | None = None
+    ) -> None:
+        self.device, self.watch = torch.device(device), watch
         self.seconds: dict[str, float] = {}
         self._progress = Progress(
             TextColumn("{task.description:<24}"),

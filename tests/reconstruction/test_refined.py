@@ -11,14 +11,16 @@ import pytest
 import torch
 
 from vg2gt.cli import main
+from vg2gt.data.sources.sparse_points import ObservedPoints
 from vg2gt.data.transforms import resize_images
-from vg2gt.geometry.cameras import resize_intrinsics
+from vg2gt.geometry.cameras import project, resize_intrinsics, unproject
 from vg2gt.inputs.inputs import load_views
-from vg2gt.inputs.pictures import find_pictures
+from vg2gt.inputs.pictures import Picture, find_pictures
 from vg2gt.io import read_cameras_json, read_gaussian_ply, write_cameras_json
 from vg2gt.monitor import Monitor
 from vg2gt.outputs.saved import read_scene, renderer_of
-from vg2gt.reconstruction.photographs import full_size, load_photographs
+from vg2gt.reconstruction.frame import SceneFrame
+from vg2gt.reconstruction.photographs import full_size, load_photographs, sparse_points
 from vg2gt.reconstruction.policy import refined_by_default, refinement_for
 from vg2gt.reconstruction.refined import _judged, refinement_lines
 from vg2gt.reconstruction.scene import Scene
@@ -159,3 +161,25 @@ def test_mistakes_are_one_line(saved, damage, said, tmp_path, monkeypatch):
     words = {"option": ["refine=default", "refine.rats.sh=1"], "value": ["--holdout", "1"]}.get(damage, [])
     with pytest.raises(SystemExit, match=said):
         vg2gt(monkeypatch, "refine", str(folder), "--steps", "1", "--quiet", "--device", "cpu", *words)
+
+
+def test_points_of_structure_from_motion_are_in_the_scenes_frame(scene: Scene) -> None:
+    """Observed in larger, wider pictures whose cameras have another unit, each point is where it was, and once."""
+    units, (height, width) = 3.0, scene.cameras.size
+    large, numbers = (2 * height, 3 * width), torch.arange(0, scene.depth[0].numel(), 97)
+    world = unproject(scene.depth[None], scene.cameras)[0, 0].flatten(0, 1)[numbers]
+    pixels, depth = (each[0] for each in project(world.expand(1, len(scene.names), -1, -1), scene.cameras))
+    pictures = []
+    for view in range(len(scene.names)):
+        middle = pixels[view].double() + 0.5  # from the left border of the view; a quarter of the width is cut off
+        places = torch.stack(((2 * middle[:, 0] + width / 2) / large[1], 2 * middle[:, 1] / large[0]), 1)
+        seen = ((places >= 0) & (places < 1)).all(1) & (depth[view] > 0)
+        observed = ObservedPoints(*(each[seen].numpy() for each in (numbers, places, units * depth[view])))
+        pictures.append(Picture(scene.names[view], large, lambda size: None, points=observed))  # pyright: ignore
+    frame = SceneFrame("reference", np.diag((units, units, units, 1.0)))
+    positions, colors = sparse_points(replace(scene, pictures=tuple(pictures), frame=frame))
+    assert len(positions) == len(world)
+    torch.testing.assert_close(positions, world, rtol=1e-4, atol=1e-4)
+    own = scene.images[0].flatten(1).T[numbers]
+    assert (colors - own).abs().mean() < 0.1
+    assert [len(each) for each in sparse_points(replace(scene, pictures=()))] == [0, 0]

@@ -9,8 +9,9 @@ import torch
 
 from tests.refinement.conftest import VIEWS, Start, run
 from vg2gt.geometry.cameras import project
+from vg2gt.geometry.spherical_harmonics import sh_to_rgb
 from vg2gt.refinement import RefineOptions
-from vg2gt.refinement.density import COVERED, fill_holes, spread
+from vg2gt.refinement.density import COVERED, fill_holes, spread, with_points
 from vg2gt.types import Gaussians
 
 ROOM = 10_000
@@ -67,3 +68,23 @@ def test_refinement_fills_unless_told_not_to(holed: Start) -> None:
     with_fill, without = (run(holed, RefineOptions(steps=12, check_every=6, holdout=3, fill=side)) for side in (4, 0))
     assert with_fill.psnr[1, with_fill.held_out].mean() > without.psnr[1, without.held_out].mean() + 1
     assert len(without.scene.gaussians) <= len(holed.gaussians)
+
+
+def test_points_get_gaussians_where_there_are_none(holed: Start, start: Start) -> None:
+    """Of points on the whole surface, those in the hole are added, with their colours and the size of their gaps."""
+    step = 7
+    points, colors = (
+        start.gaussians.means[::step],
+        sh_to_rgb(start.gaussians.sh[::step, :1], start.gaussians.means[::step]),
+    )
+    found = with_points(holed.gaussians, points, colors)
+    added = found.select(torch.arange(len(found)) >= len(holed.gaussians))
+    lost = len(start.gaussians) - len(holed.gaussians)
+    assert 0.6 * lost / step < len(added) < 1.2 * lost / step
+    torch.testing.assert_close(sh_to_rgb(added.sh[:, :1], added.means), colors[torch.isin(points, added.means).all(1)])
+    gaps = torch.cdist(added.means, points).topk(4, largest=False).values[:, 1:].mean(1)
+    torch.testing.assert_close(added.scales, gaps[:, None].expand(-1, 3), rtol=1e-3, atol=1e-5)
+    before, after = holes(holed, holed.gaussians)[0], holes(holed, found)[0]
+    assert after < 0.6 * before
+    assert len(with_points(start.gaussians, points, colors)) == len(start.gaussians)  # they have one already
+    assert len(with_points(holed.gaussians, points[:3], colors[:3])) == len(holed.gaussians)

@@ -11,6 +11,7 @@ from tests.refinement.conftest import VIEWS, Start, run
 from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.refinement import Refined, RefinedScene, RefineLoss, RefineOptions, RefineRates
 from vg2gt.refinement.density import GROWTH, merged, supported
+from vg2gt.refinement.options import Progress
 from vg2gt.types import Gaussians
 
 COLOUR = RefineLoss(depth_consistency=0, normal_render=0, normal_decoded=0)
@@ -71,10 +72,11 @@ def test_it_repeats_to_the_bit_and_never_looks_at_held_out_views(refined: Refine
 
 
 def test_an_interruption_keeps_the_best_state(start: Start) -> None:
-    def interrupt(step: int, done: float, psnr: float) -> None:
-        assert done == step / 100
-        assert psnr > 10
-        if step == 7:
+    def interrupt(progress: Progress) -> None:
+        assert progress.share == progress.steps / 100
+        assert progress.psnr > 10
+        assert len(progress.scene().gaussians) > 100
+        if progress.steps == 7:
             raise KeyboardInterrupt
 
     stopped = run(start, RefineOptions(steps=100, check_every=5, loss=COLOUR), observe=interrupt)
@@ -209,7 +211,7 @@ def test_options_out_of_range(start: Start) -> None:
         run(replace(start, gaussians=start.gaussians.map(lambda tensor: tensor[:0])), RefineOptions())
     with pytest.raises(ValueError, match=r"refine.steps must be at least 1, or null"):
         RefineOptions(steps=0)
-    with pytest.raises(ValueError, match=r"refine.geometry_every must be 1 without a colour term.*, got 4"):
+    with pytest.raises(ValueError, match=r"refine.geometry_every must be 1 without a term of colour.*, got 4"):
         RefineOptions(geometry_every=4, loss=RefineLoss(color_l1=0.0, ssim=0.0))
     with pytest.raises(ValueError, match=r"refine.fill must be at least 0, got -1"):
         RefineOptions(fill=-1)

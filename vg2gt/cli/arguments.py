@@ -5,10 +5,11 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import hydra
 from omegaconf import DictConfig
@@ -18,9 +19,13 @@ from vg2gt.cli.commands import COMMANDS, DATA_COMMANDS
 from vg2gt.cli.errors import errors_in_one_line
 from vg2gt.config import config_dir
 
+if TYPE_CHECKING:
+    from vg2gt.viewer.live import LiveView
+
 folders.register()
 
 OVERRIDE = re.compile(r"(\+\+?|~)?[A-Za-z_][\w./]*=")
+WATCH = "serve a page that shows the scene while it is refined"
 OVERRIDES = "\nmodel, backend, renderer and refinement are set by key=value: backend=da3_small refine.full.size=1008"
 
 
@@ -47,6 +52,22 @@ def hydra_command(name: str) -> Callable[[Callable[[DictConfig], None]], Callabl
         return main
 
     return decorate
+
+
+@contextmanager
+def watching(wanted: bool) -> Iterator[LiveView | None]:
+    """Serves a page that shows a scene while it is refined, until the end of the block, and prints its address."""
+    if not wanted:
+        yield None
+        return
+    from vg2gt.viewer.live import LiveView
+
+    view = LiveView()
+    print(f"watch the refinement at {view.address}", file=sys.stderr)
+    try:
+        yield view
+    finally:
+        view.close()
 
 
 def flag_parser(name: str, details: str = "") -> argparse.ArgumentParser:

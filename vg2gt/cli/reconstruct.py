@@ -9,7 +9,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vg2gt.cli.arguments import OVERRIDES, add_common_flags, flag_parser, list_of_names, listing, separate
+from vg2gt.cli.arguments import (
+    OVERRIDES,
+    WATCH,
+    add_common_flags,
+    flag_parser,
+    list_of_names,
+    listing,
+    separate,
+    watching,
+)
 from vg2gt.cli.errors import errors_in_one_line
 from vg2gt.outputs.output_names import DEFAULT, LARGE, OUTPUTS, PREDICTED, TILES
 from vg2gt.reconstruction.windows import WINDOWS
@@ -60,6 +69,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     add("--min-confidence", type=float, metavar="C", help="drop Gaussians whose depth error bound exceeds 1 - C")
     add("--drop", type=list_of_names, default=[], metavar="LIST", help="drop Gaussians by status, a list of: guessed, "
         "contradicted, single (seen by one view), unseen")  # fmt: skip
+    add("--watch", action="store_true", help=WATCH)
     add_common_flags(arguments, DEFAULT)
     given, overrides = separate(argv)
     options = arguments.parse_args(given)
@@ -86,7 +96,10 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     overrides = [each for each in overrides if each not in how_to_refine]
     _check(options, overrides)
     check_refinement(options.refine, options.quality, how_to_refine)
-    with Monitor(show=not options.quiet, device=choose_device(options.device)) as monitor:
+    with (
+        watching(options.watch) as watch,
+        Monitor(not options.quiet, choose_device(options.device), watch) as monitor,
+    ):
         with monitor.stage("load model"):
             ready = load(options.ckpt, overrides=overrides, device=options.device)
         scene = _scene(options, ready, how_to_refine, monitor)

@@ -7,7 +7,7 @@ import logging
 from collections.abc import Sequence
 from pathlib import Path
 
-from vg2gt.cli.arguments import add_common_flags, flag_parser, listing, separate
+from vg2gt.cli.arguments import WATCH, add_common_flags, flag_parser, listing, separate, watching
 from vg2gt.cli.errors import errors_in_one_line
 from vg2gt.outputs.output_names import DEFAULT, OUTPUTS
 
@@ -24,6 +24,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     add("--steps", type=int, metavar="N", help="number of steps; default: 12 per view, 400 for photos")
     add("--seconds", type=float, metavar="S", help="stop after S seconds, or after --steps if that comes first")
     add("--holdout", type=int, metavar="N", help="exclude every N-th view and print its PSNR before and after")
+    add("--watch", action="store_true", help=WATCH)
     add_common_flags(arguments, DEFAULT)
     given, overrides = separate(argv)
     options = arguments.parse_args(given)
@@ -48,7 +49,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     check_folder(out, options.save, options.overwrite)
     read_options("default", overrides)  # reports wrong options before anything is read
     device = choose_device(options.device)
-    with Monitor(show=not options.quiet, device=device) as monitor, memory_advice(ADVICE):
+    with watching(options.watch) as watch, Monitor(not options.quiet, device, watch) as monitor, memory_advice(ADVICE):
         with monitor.stage("read scene"):
             scene = read_scene(options.scene, Renderer(mode=options.mode), device)
         changes = {"steps": options.steps, "seconds": options.seconds, "holdout": options.holdout}

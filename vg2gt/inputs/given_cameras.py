@@ -111,13 +111,17 @@ def recording_pictures(source: FileSource) -> list[Picture]:
 
         row = index.row(frame)
         color = index.color[row]
+        depths = points = None
+        if isinstance(source, COLMAP):
+            depths, points = source.point_depths(scene, frame), source.sound_points(scene, frame)
         return Picture(
             color.stem,
             index.own_size(row),
             read,
             kind,
             source.has_depth,
-            source.point_depths(scene, frame) if isinstance(source, COLMAP) else None,
+            depths,
+            points,
             path=color if color.is_file() and is_photo(color) else None,
             pose=index.world_to_camera[row],
             intrinsics=index.intrinsics[row],

@@ -22,6 +22,7 @@ from vg2gt.data.base import Frames
 from vg2gt.data.sources.masks import FOLDER as MASKS
 from vg2gt.data.sources.masks import joined_masks, mask_beside, resized_mask, warn_without_mask
 from vg2gt.data.sources.parsing import HEIC_SUFFIXES, PHOTO_SUFFIXES
+from vg2gt.data.sources.sparse_points import ObservedPoints
 from vg2gt.data.transforms import from_bytes, to_bytes
 from vg2gt.inputs.folders import image_files, is_photo
 from vg2gt.inputs.panoramas import Panorama, find_panoramas, whole_pixels
@@ -57,6 +58,7 @@ class Picture:
         source: origin of its camera (and depth, if ``has_depth``); empty if it has no camera.
         has_depth: whether its frame has depth.
         point_depths: ``[n]`` z-depth of the sparse points that it sees; None if there are none.
+        points: those of them that are not likely outliers; None if there are none.
         focal: focal length in pixels from EXIF; None if unknown.
         path: its file; None if it has no file of its own.
         pose: ``[4, 4]`` float64 given ``world_to_camera``; None if there is none.
@@ -72,6 +74,7 @@ class Picture:
     source: str = ""
     has_depth: bool = False
     point_depths: NDArray[np.float32] | None = None
+    points: ObservedPoints | None = None
     focal: float | None = None
     path: Path | None = None
     pose: NDArray[np.float64] | None = None

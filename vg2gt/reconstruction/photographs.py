@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import torch
+from torch import Tensor
+from torch.nn import functional as F
 
 from vg2gt.data.transforms import resize_to_cover, to_bytes
-from vg2gt.geometry.cameras import crop_intrinsics, resize_intrinsics
+from vg2gt.geometry.cameras import crop_intrinsics, invert_rigid, resize_intrinsics
 from vg2gt.inputs.inputs import covering_size, photo_intrinsics
 from vg2gt.inputs.pictures import Picture
 from vg2gt.monitor import Monitor
 from vg2gt.refinement import Photographs
 from vg2gt.types import Cameras
+
+if TYPE_CHECKING:
+    from vg2gt.reconstruction.scene import Scene
 
 
 def full_size(pictures: Sequence[Picture], working: tuple[int, int], longest: int) -> tuple[int, int]:
@@ -60,3 +66,33 @@ def load_photographs(pictures: Sequence[Picture], cameras: Cameras, longest: int
             intrinsics[view] = crop_intrinsics(own, left, top).float()
             advance()
     return Photographs(images, intrinsics, masks)
+
+
+def sparse_points(scene: Scene) -> tuple[Tensor, Tensor]:
+    """Returns the points of structure from motion that a scene's views observe.
+
+    Returns:
+        Positions ``[N, 3]`` in the scene's frame and colours ``[N, 3]`` in [0, 1], means over the views; N is 0 if the
+        pictures have no points.
+    """
+    empty = torch.zeros(0, device=scene.images.device)
+    numbers, found = [empty.long()], [empty.new_zeros(0, 6)]
+    for view, picture in enumerate(scene.pictures):
+        if picture.points is None or scene.frame is None:
+            continue
+        places, depth = (torch.from_numpy(each).to(empty) for each in (picture.points.places, picture.points.depth))
+        own = scene.cameras.intrinsics[0, view]
+        whole = photo_intrinsics(own, scene.cameras.size, picture.size)  # of the picture, of which the view is a crop
+        pixels = places * places.new_tensor(picture.size[::-1]) - 0.5
+        tangent = (pixels - whole[:2, 2]) / whole[[0, 1], [0, 1]]
+        shown = (tangent * own[[0, 1], [0, 1]] + own[:2, 2] + 0.5) / places.new_tensor(scene.cameras.size[::-1])
+        local = F.pad(tangent, (0, 1), value=1.0) * (depth[:, None] / scene.frame.scale)
+        pose = invert_rigid(scene.cameras.world_to_camera[0, view])
+        grid = (2 * shown - 1)[None, None]
+        colors = F.grid_sample(scene.images[view : view + 1], grid, align_corners=False)[0, :, 0].T
+        inside = ((shown >= 0) & (shown < 1)).all(1)
+        numbers.append(torch.from_numpy(picture.points.numbers).to(empty.device)[inside])
+        found.append(torch.cat((local @ pose[:3, :3].T + pose[:3, 3], colors), 1)[inside])
+    rows, counts = torch.cat(numbers).unique(return_inverse=True, return_counts=True)[1:]
+    means = empty.new_zeros(len(counts), 6).index_add_(0, rows, torch.cat(found)) / counts[:, None]
+    return means[:, :3], means[:, 3:]

@@ -9,10 +9,11 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from vg2gt.monitor import Monitor
-from vg2gt.reconstruction.photographs import load_photographs
+from vg2gt.reconstruction.photographs import load_photographs, sparse_points
 from vg2gt.reconstruction.policy import Quality, Refinement, chosen_refinement
 from vg2gt.reconstruction.surroundings import without_debris
 from vg2gt.refinement import Observations, RefineOptions, exposure_rates, fold_of, refine, sharpened, split_views
+from vg2gt.refinement.options import Observer, Progress
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -53,15 +54,16 @@ def refine_scene(
         at_working_size = replace(options, seconds=WORKING_SHARE * options.seconds)
     fold = None if full is None else fold_of(split_views(seen, options.holdout)[0], full)
     with monitor.stage("refine", 100, " %") as advance:
-        observe = _shown(advance)
-        refined = refine(scene.gaussians, scene.cameras, seen, scene.renderer, at_working_size, observe, clock, fold)
+        observe = _shown(advance, monitor)
+        start = (scene.gaussians, scene.cameras, seen, scene.renderer)
+        refined = refine(*start, at_working_size, observe, clock, fold, sparse_points(scene))
     if full is not None and refined.ended in ("steps", "seconds"):
         try:
             photographs = load_photographs(scene.pictures, refined.scene.cameras, full.size, monitor).to(device)
             left = None if options.seconds is None else options.seconds - (clock() - began)
             if left is None or left > 0:
                 with monitor.stage("refine at full size", 100, " %") as advance:
-                    observe = _shown(advance)
+                    observe = _shown(advance, monitor)
                     refined = sharpened(refined, photographs, seen, scene.renderer, options, left, observe, clock)
             else:
                 log.warning("no time is left to refine at full size: allow more than %g seconds", options.seconds)
@@ -89,8 +91,13 @@ def refined_by_policy(
     return scene if options is None else refine_scene(scene, options, monitor)
 
 
-def _shown(advance: Callable[..., None]) -> Callable[[int, float, float], None]:
-    return lambda _, done, psnr: advance(100 * done, f"{psnr:.2f} dB")
+def _shown(advance: Callable[..., None], monitor: Monitor) -> Observer:
+    def observe(progress: Progress) -> None:
+        advance(100 * progress.share, f"{progress.psnr:.2f} dB")
+        if monitor.watch is not None:
+            monitor.watch(progress.scene)
+
+    return observe
 
 
 def refinement_figures(scene: Scene) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import torch
+from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -24,6 +25,8 @@ FEWEST = 2  # minimum number of views that agree with Gaussians to merge
 GROWTH = 2.0  # factor on merged standard deviations: neighbours overlap, and refinement has to add the detail
 OPACITY = 0.5  # of merged Gaussians
 COVERED = 0.5  # minimum accumulated opacity of a covered pixel
+NEIGHBOURS = 3  # of a point of structure from motion, whose mean distance is its size
+POINT = 0.5  # its opacity
 FILLED = 0.9  # opacity of a Gaussian in a hole: high enough to cover its block, low enough to be pruned if it is wrong
 
 
@@ -87,6 +90,28 @@ def merged(gaussians: Gaussians, cell: float) -> Gaussians:
         plan.batch,
         gaussians.background,
     )
+
+
+@torch.no_grad()
+def with_points(gaussians: Gaussians, points: Tensor, colors: Tensor) -> Gaussians:
+    """Adds round Gaussians at points of structure from motion that no Gaussian is near.
+
+    A Gaussian is as large as the mean distance to the three nearest points, as in 3DGS. A point that has a Gaussian
+    within this distance gets none.
+
+    Args:
+        gaussians: the scene (B = 1).
+        points: ``[N, 3]`` positions.
+        colors: ``[N, 3]`` in [0, 1].
+    """
+    if len(points) <= NEIGHBOURS:
+        return gaussians
+    positions = points.cpu().numpy()
+    gaps = torch.from_numpy(KDTree(positions).query(positions, NEIGHBOURS + 1)[0][:, 1:].mean(1)).to(points)
+    nearest = torch.from_numpy(KDTree(gaussians.means.cpu().numpy()).query(positions)[0]).to(points)
+    lonely = nearest > gaps
+    size = gaps[lonely, None]
+    return gaussians.joined(_round(points[lonely], size, POINT, colors[lonely]))
 
 
 @torch.no_grad()
@@ -161,12 +186,16 @@ def _blocks(images: Tensor, hole: Tensor, depth: Tensor, camera: Cameras, pixels
     means = mean(unproject(depth[None], camera)[0].movedim(-1, 1))
     focal = camera.intrinsics[0, 0, [0, 1], [0, 1]].mean()
     size = ALONE * pixels * mean(depth[:, None]) / focal  # [N, 1]
-    turn = F.pad(torch.ones_like(size), (0, 3))
+    return _round(means, size, FILLED, mean(images))
+
+
+def _round(means: Tensor, size: Tensor, opacity: float, colors: Tensor) -> Gaussians:
+    """Round Gaussians at ``means [N, 3]`` of standard deviation ``size [N, 1]`` and of ``colors [N, 3]``."""
     return Gaussians(
         means,
-        turn,
+        F.pad(torch.ones_like(size), (0, 3)),
         size.expand(-1, 3),
-        torch.full_like(size[:, 0], FILLED),
-        rgb_to_sh(mean(images))[:, None],
+        torch.full_like(size[:, 0], opacity),
+        rgb_to_sh(colors)[:, None],
         torch.zeros_like(size[:, 0], dtype=torch.int64),
     )

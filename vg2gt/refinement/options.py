@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,9 +14,31 @@ from vg2gt.geometry.spherical_harmonics import MAX_DEGREE
 from vg2gt.losses.gaussian import normal_error, structure_loss, weighted_mean
 from vg2gt.types import Cameras, Gaussians, Render, TensorRecord
 
+if TYPE_CHECKING:
+    from vg2gt.refinement.parameters import RefinedScene
+
 RENDERINGS = 12  # of each view, if neither steps nor seconds are set
 MIN_ALPHA = 0.5
 MIN_CROP = 16  # pixels: SSIM needs its window
+
+
+class Progress(NamedTuple):
+    """State of a refinement after a step.
+
+    Attributes:
+        steps: number of steps made.
+        share: share of the stage that is done, in [0, 1].
+        psnr: mean PSNR of the last 20 steps in dB; 0 if all that they showed was masked.
+        scene: returns the current scene, without autograd graph.
+    """
+
+    steps: int
+    share: float
+    psnr: float
+    scene: Callable[[], RefinedScene]
+
+
+Observer = Callable[[Progress], None]
 
 
 @dataclass(frozen=True)

@@ -127,6 +127,10 @@ class Parameters:
         gain, bias = self._centred(values["gain"]).exp(), self._centred(values["bias"])
         return RefinedScene(gaussians, self._moved(values["cameras"]), gain, bias)
 
+    def present(self) -> RefinedScene:
+        """Returns the current scene without autograd graph."""
+        return self.scene().detach()
+
     @property
     def cameras(self) -> Cameras:
         """The current cameras, without autograd graph."""

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from vg2gt.losses.gaussian import where_it_counts
 from vg2gt.metrics import psnr
-from vg2gt.refinement.density import fill_holes, supported
-from vg2gt.refinement.options import Observations, RefineLoss, RefineOptions
+from vg2gt.refinement.density import fill_holes, supported, with_points
+from vg2gt.refinement.options import Observations, Observer, Progress, RefineLoss, RefineOptions
 from vg2gt.refinement.parameters import Parameters, RefinedScene
 from vg2gt.refinement.photographs import Photographs
 from vg2gt.refinement.sharpen import Sharpened, sharpen
@@ -67,7 +67,7 @@ def sharpened(
     renderer: Renderer,
     options: RefineOptions,
     seconds: float | None = None,
-    observe: Callable[[int, float, float], None] | None = None,
+    observe: Observer | None = None,
     clock: Callable[[], float] = time.monotonic,
 ) -> Refined:
     """Continues a refinement on the photographs at their own size; arguments as for :func:`sharpen`."""
@@ -123,9 +123,10 @@ def refine(
     seen: Observations,
     renderer: Renderer,
     options: RefineOptions | None = None,
-    observe: Callable[[int, float, float], None] | None = None,
+    observe: Observer | None = None,
     clock: Callable[[], float] = time.monotonic,
     fold: Tensor | None = None,
+    points: tuple[Tensor, Tensor] | None = None,
 ) -> Refined:
     """Optimises one scene on the images of its views.
 
@@ -137,10 +138,10 @@ def refine(
         seen: observations of the views, on the same device.
         renderer: renderer of the scene, here and later.
         options: options of the refinement; default :class:`RefineOptions`.
-        observe: called after every step with the number of steps, the share of the refinement that is done, and the
-            mean PSNR of the last 20 steps in dB.
+        observe: called after every step.
         clock: returns the time in seconds.
         fold: ``[F]`` views that are not trained yet, because a later stage scores them (:func:`fold_of`).
+        points: ``[N, 3]`` positions and ``[N, 3]`` colours of points that get a Gaussian where the scene has none.
 
     Raises:
         ValueError: if there are no Gaussians, or images and cameras do not match.
@@ -158,7 +159,7 @@ def refine(
     if not seen.shown().any():
         raise ValueError("the masks of all views hide every pixel: there is nothing to refine on; check the masks")
     with torch.enable_grad():
-        return _Refinement(gaussians, cameras, seen, renderer, options, clock, fold).run(observe)
+        return _Refinement(gaussians, cameras, seen, renderer, options, clock, fold, points).run(observe)
 
 
 class _Refinement:
@@ -171,6 +172,7 @@ class _Refinement:
         options: RefineOptions,
         clock: Callable[[], float],
         fold: Tensor | None = None,
+        points: tuple[Tensor, Tensor] | None = None,
     ) -> None:
         self.seen, self.renderer, self.clock = seen, renderer, clock
         self.began = clock()
@@ -198,13 +200,15 @@ class _Refinement:
         self.recent: list[float] = []
         self.steps = 0
         begun = self.start
+        if points is not None:
+            begun = replace(begun, gaussians=with_points(begun.gaussians, *points))
         if options.fill:
             room = int(MAX_GROWTH * len(start)) - len(start)
             filled = fill_holes(begun.gaussians, cameras, seen, renderer, self.trained, options.fill, room)
             begun = replace(begun, gaussians=filled)
         self.parameters = Parameters(begun, options.rates, self.pixel, self.depth, self.trained)
 
-    def run(self, observe: Callable[[int, float, float], None] | None) -> Refined:
+    def run(self, observe: Observer | None) -> Refined:
         """Runs steps and checks until the refinement ends."""
         ended = ""
         try:
@@ -212,7 +216,7 @@ class _Refinement:
                 ended = self._step()
                 if observe is not None:
                     recent = self.recent[-20:]
-                    observe(self.steps, self._done(), sum(recent) / len(recent))
+                    observe(Progress(self.steps, self._done(), sum(recent) / len(recent), self.parameters.present))
         except KeyboardInterrupt:
             ended = "interrupted"
         loss, after = self._score(self.best, torch.arange(len(self.seen.images)))

@@ -15,7 +15,7 @@ from vg2gt.losses.gaussian import where_it_counts
 from vg2gt.metrics import psnr
 from vg2gt.refinement.exposure import log_exposures
 from vg2gt.refinement.growth import in_front, remove_idle, split_large
-from vg2gt.refinement.options import FullSizeOptions, Observations, RefineLoss, RefineOptions
+from vg2gt.refinement.options import FullSizeOptions, Observations, Observer, Progress, RefineLoss, RefineOptions
 from vg2gt.refinement.parameters import Parameters, RefinedScene
 from vg2gt.refinement.photographs import Crop, CropOrder, Photographs, whole_views
 from vg2gt.rendering import Renderer
@@ -72,7 +72,7 @@ def sharpen(
     options: RefineOptions,
     seconds: float | None = None,
     trained: Tensor | None = None,
-    observe: Callable[[int, float, float], None] | None = None,
+    observe: Observer | None = None,
     clock: Callable[[], float] = time.monotonic,
 ) -> Sharpened:
     """Optimises a refined scene on crops of its photographs.
@@ -87,8 +87,7 @@ def sharpen(
         options: options; ``options.full`` must not be None.
         seconds: maximum time, > 0; None: until ``options.full.steps`` are made.
         trained: ``[N]`` views to train on; None: all that are not masked as a whole.
-        observe: called after every step with the number of steps, the share of the stage that is done, and the mean
-            PSNR in dB of the last 20 crops that were not masked as a whole; 0: there was none.
+        observe: called after every step.
         clock: returns the time in seconds.
     """
     if trained is None:
@@ -137,7 +136,7 @@ class _Sharpening:
         self.recent: list[float] = []
         self.scores: list[float] = []
 
-    def run(self, observe: Callable[[int, float, float], None] | None) -> Sharpened:
+    def run(self, observe: Observer | None) -> Sharpened:
         """Runs steps, growth and checks until the stage ends."""
         ended = ""
         try:
@@ -147,11 +146,12 @@ class _Sharpening:
             while not ended:
                 ended = self._step()
                 if observe is not None:
-                    observe(self.steps, self._done(), sum(self.recent) / max(1, len(self.recent)))
+                    recent = sum(self.recent) / max(1, len(self.recent))
+                    observe(Progress(self.steps, self._done(), recent, self.parameters.present))
         except KeyboardInterrupt:
             ended = "interrupted"
         useless = ended == "no gain"
-        scene = self.parameters.start if useless else self.parameters.scene().detach()
+        scene = self.parameters.start if useless else self.parameters.present()
         scene = replace(scene, cameras=self.whole.cameras(scene.cameras))
         return Sharpened(
             scene=scene,

@@ -48,14 +48,14 @@ def errors_of(found: SparsePoints, right: SparsePoints) -> np.ndarray:
     """Relative errors of the depths that ``found`` has, by the places that both know."""
     errors = []
     for view in range(VIEWS):
-        truth = {tuple(place): depth for place, depth in zip(right.places(view), right.depth(view), strict=True)}
-        told = zip(found.places(view), found.depth(view), strict=True)
+        truth = {tuple(place): depth for place, depth in zip(right.of(view).places, right.of(view).depth, strict=True)}
+        told = zip(found.of(view).places, found.of(view).depth, strict=True)
         errors += [abs(depth / truth[tuple(place)] - 1) for place, depth in told]
     return np.array(errors)
 
 
 def count(points: SparsePoints) -> int:
-    return sum(len(points.depth(view)) for view in range(VIEWS))
+    return sum(len(points.of(view).depth) for view in range(VIEWS))
 
 
 def test_what_is_right_stays_and_without_observations_there_is_no_depth() -> None:
@@ -96,4 +96,4 @@ def test_points_alone_in_space_go() -> None:
         return np.where(np.arange(POINTS)[:, None] == 7, [0.0, 0.0, 2.0], positions)
 
     found = SparsePoints(model_of(moved=one_alone, seen_as=one_alone))
-    assert min(found.depth(view).min() for view in range(VIEWS)) > 3
+    assert min(found.of(view).depth.min() for view in range(VIEWS)) > 3

@@ -16,7 +16,7 @@ from vg2gt.data.sources.index import PosedImage, SceneIndex, make_index
 from vg2gt.data.sources.masks import FOLDER as MASKS
 from vg2gt.data.sources.masks import find_masks
 from vg2gt.data.sources.parsing import IMAGE_SUFFIXES, errors_name, existing_image, named_file
-from vg2gt.data.sources.sparse_points import SparsePoints
+from vg2gt.data.sources.sparse_points import ObservedPoints, SparsePoints
 from vg2gt.data.sources.undistortion import posed_image, size_on_disk
 from vg2gt.io import colmap_images, colmap_pose, read_colmap
 from vg2gt.io.cameras_json import invert_pose
@@ -102,21 +102,25 @@ class COLMAP(FileSource):
         depth = None
         if self.has_depth:
             points = self._scene_points(scene, folder)
-            depth = {i: model_folder for i in color if len(points.depth(i))}
+            depth = {i: model_folder for i in color if len(points.of(i).depth)}
         return make_index(scene, folder, color, depth, poses, {}, posed=posed)
 
     def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
         """Returns depth at the pixels of the points that a view observes; the nearest point wins a pixel."""
-        points, frame = self._scene_points(index.name, index.folder), index.frame_ids[row]
+        points = self._scene_points(index.name, index.folder).of(index.frame_ids[row])
         extent = np.array((size[1], size[0]))
-        pixels = np.floor(points.places(frame) * extent).astype(np.int64).clip(max=extent - 1)
+        pixels = np.floor(points.places * extent).astype(np.int64).clip(max=extent - 1)
         depth = np.full(size, np.inf, np.float32)
-        np.minimum.at(depth, (pixels[:, 1], pixels[:, 0]), points.depth(frame))
+        np.minimum.at(depth, (pixels[:, 1], pixels[:, 0]), points.depth)
         return np.where(np.isfinite(depth), depth, 0)
 
     def point_depths(self, scene: str, frame: int) -> NDArray[np.float32]:
         """Returns the positive z-depth ``[n]`` of all points that a frame observes, including likely outliers."""
-        return self._scene_points(scene, self._folders[scene], sound=False).depth(frame)
+        return self._scene_points(scene, self._folders[scene], sound=False).of(frame).depth
+
+    def sound_points(self, scene: str, frame: int) -> ObservedPoints:
+        """Returns the points that a frame observes, without likely outliers."""
+        return self._scene_points(scene, self._folders[scene]).of(frame)
 
     def _scene_points(self, scene: str, folder: Path, sound: bool = True) -> SparsePoints:
         if (scene, sound) not in self._points:

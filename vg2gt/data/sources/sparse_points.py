@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from copy import deepcopy
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,21 @@ Points beyond it are isolated and count as outliers.
 """
 _NEIGHBOURS = 3
 _FAR = 1e30
+
+
+@dataclass(frozen=True)
+class ObservedPoints:
+    """Points that one view observes.
+
+    Attributes:
+        numbers: ``[n]`` number of each point, the same in all views.
+        places: ``[n, 2]`` positions (x, y) in the undistorted image as a fraction of its size, in [0, 1).
+        depth: ``[n]`` positive z-depths.
+    """
+
+    numbers: NDArray[np.int64]
+    places: NDArray[np.float64]
+    depth: NDArray[np.float32]
 
 
 class SparsePoints:
@@ -63,15 +79,13 @@ class SparsePoints:
         agreeing = np.bincount(rows, np.concatenate([view[3] for view in views]), len(owners))
         agreed = owners[2 * agreeing >= np.bincount(rows, minlength=len(owners))] if sound else owners
         kept = [good & np.isin(owner, agreed) for owner, _, _, good in views]
-        self._views = [(view[1][rows], view[2][rows]) for view, rows in zip(views, kept, strict=True)]
+        self._views = [
+            ObservedPoints(*(each[rows] for each in view[:3])) for view, rows in zip(views, kept, strict=True)
+        ]
 
-    def places(self, frame: int) -> NDArray[np.float64]:
-        """Returns the positions ``[n, 2]`` (x, y) of a frame's points, in [0, 1)."""
-        return self._views[frame][0]
-
-    def depth(self, frame: int) -> NDArray[np.float32]:
-        """Returns the positive z-depths ``[n]`` of a frame's points."""
-        return self._views[frame][1]
+    def of(self, frame: int) -> ObservedPoints:
+        """Returns the points that a frame observes."""
+        return self._views[frame]
 
 
 def _undistorted(features: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
