@@ -9,8 +9,9 @@ import torch
 
 from tests.refinement.conftest import VIEWS, Start
 from vg2gt.geometry.cameras import invert_rigid
+from vg2gt.kernels.adam import update_rows
 from vg2gt.refinement import Observations, RefinedScene, RefineLoss, RefineRates
-from vg2gt.refinement.parameters import Parameters
+from vg2gt.refinement.parameters import BETAS, EPSILON, Parameters, update_rows_reference
 from vg2gt.refinement.refine import ViewOrder, split_views
 
 PIXEL, DEPTH = 0.01, 2.0
@@ -116,3 +117,35 @@ def test_a_perfect_view_has_no_loss(start: Start) -> None:
     hits = (rendered.depth > 0) & (rendered.alpha > 0.5)
     trust = torch.where(hits[0], seen.depth_conf, 0)
     assert float(moved) == pytest.approx(float((0.05 * rendered.depth[0] * trust).sum() / trust.sum()), rel=1e-3)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("shape", [(), (3,), (2, 3)])
+def test_compiled_adam_is_adam(shape: tuple[int, ...], dtype: torch.dtype) -> None:
+    """The kernel equals the plain update, and both equal torch's Adam where every row changes in every step."""
+    torch.manual_seed(0)
+    count, rate = 9000, 0.03
+    value = torch.randn(count, *shape, dtype=dtype)
+    leaf = value.clone().requires_grad_(True)
+    adam = torch.optim.Adam([leaf], rate, BETAS, EPSILON)
+    states = [(value.clone(), (torch.zeros_like(value), torch.zeros_like(value))) for _ in range(2)]
+    unit = torch.ones(count, dtype=dtype)
+    every = torch.randperm(count)
+    for step in range(1, 4):
+        grad = torch.randn_like(value)
+        corrections = [torch.full((count,), 1 / (1 - beta**step), dtype=dtype) for beta in BETAS]
+        for update, (own, moments) in zip((update_rows, update_rows_reference), states, strict=True):
+            update(own, moments, grad[every], every, corrections, unit, (*BETAS, EPSILON, rate))
+        leaf.grad = grad
+        adam.step()
+    torch.testing.assert_close(states[0], states[1])
+    torch.testing.assert_close(states[0][0], leaf.detach())
+    # some rows only, in units of their own: the others stay
+    rows, unit = torch.arange(0, count, 3), torch.rand(count, dtype=dtype) + 0.5
+    before, grad = states[0][0].clone(), torch.randn(len(rows), *shape, dtype=dtype)
+    corrections = [each[: len(rows)] for each in corrections]
+    for update, (own, moments) in zip((update_rows, update_rows_reference), states, strict=True):
+        update(own, moments, grad, rows, corrections, unit, (*BETAS, EPSILON, rate))
+    torch.testing.assert_close(states[0], states[1])
+    assert torch.equal(states[0][0][1::3], before[1::3])
+    assert not torch.equal(states[0][0][::3], before[::3])

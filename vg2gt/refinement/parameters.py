@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -13,6 +13,7 @@ from torch.nn import functional as F
 from vg2gt.geometry.alignment import Similarity
 from vg2gt.geometry.cameras import compose, invert_rigid
 from vg2gt.geometry.rotations import quat_to_matrix
+from vg2gt.kernels.adam import update_rows
 from vg2gt.refinement.options import RefineRates
 from vg2gt.types import Cameras, Gaussians, TensorRecord
 
@@ -166,30 +167,29 @@ class Parameters:
         grads = {name: leaf.grad for name, leaf in self._leaves.items() if leaf.grad is not None and leaf.numel()}
         if not torch.stack([grad.sum() for grad in grads.values()]).isfinite().all():
             return False
-        rows = slice(None) if self._rows is None else self._rows
+        every = torch.arange(len(self), device=self.counts.device)
+        rows = every if self._rows is None else self._rows
         self.steps += 1
         self.counts[rows] += 1
+        corrections = [1 / (1 - beta ** self.counts[rows]) for beta in BETAS]
+        update = update_rows if rows.device.type == "cpu" else update_rows_reference
+        ones = torch.ones_like(self.unit)
         for name, grad in grads.items():
-            if rate := share * self.rates[name]:
-                self._update(name, grad, rate, rows if name in OF_GAUSSIANS else slice(None))
+            rate = share * self.rates[name]
+            if rate and name in OF_GAUSSIANS:
+                unit = self.unit if name == "means" else ones
+                args = (self.values[name], self.moments[name], grad, rows, corrections, unit)
+                update(*args, (*BETAS, EPSILON, rate))
+            elif rate:
+                self._update_views(name, grad, rate)
         return True
 
-    def _update(self, name: str, grad: Tensor, rate: float, rows: Tensor | slice) -> None:
-        value, (first, second) = self.values[name], self.moments[name]
-        unit = self.unit[rows, None] if name == "means" else 1.0
-        grad = grad * unit
-        # a slice is updated in place; rows by an index are copied and written back
-        mean = first[rows].lerp_(grad, 1 - BETAS[0])
-        square = second[rows].mul_(BETAS[1]).addcmul_(grad, grad, value=1 - BETAS[1])
-        if name in OF_GAUSSIANS:
-            count = self.counts[rows].view(-1, *[1] * (grad.dim() - 1))
-            corrections = (1 - BETAS[0] ** count, 1 - BETAS[1] ** count)
-        else:
-            corrections = tuple(1 - beta**self.steps for beta in BETAS)
-        change = mean / corrections[0] / ((square / corrections[1]).sqrt_().add_(EPSILON)) * unit
-        if isinstance(rows, Tensor):
-            first[rows], second[rows] = mean, square
-        value[rows] -= rate * change
+    def _update_views(self, name: str, grad: Tensor, rate: float) -> None:
+        """Updates what belongs to the views; all of it changes in every step."""
+        views = torch.arange(len(grad), device=grad.device)
+        corrections = [grad.new_full((len(grad),), 1 / (1 - beta**self.steps)) for beta in BETAS]
+        args = (self.values[name], self.moments[name], grad, views, corrections, grad.new_ones(len(grad)))
+        update_rows_reference(*args, (*BETAS, EPSILON, rate))
 
     @torch.no_grad()
     def prune(self) -> None:
@@ -239,3 +239,27 @@ class Parameters:
         moments = self.moments | {name: tuple(map(change, self.moments[name])) for name in OF_GAUSSIANS}
         # at once, because Ctrl-C during the copies must leave a scene that fits together
         self.unit, self.size, self.counts, self.values, self.moments = unit, size, counts, values, moments
+
+
+def update_rows_reference(
+    value: Tensor,
+    moments: tuple[Tensor, Tensor],
+    grad: Tensor,
+    rows: Tensor,
+    corrections: Sequence[Tensor],
+    unit: Tensor,
+    settings: tuple[float, float, float, float],
+) -> None:
+    """:func:`vg2gt.kernels.adam.update_rows` in plain torch, for any device; arguments as there."""
+    beta, gamma, epsilon, rate = settings
+    first, second = moments
+
+    def per_row(numbers: Tensor) -> Tensor:
+        return numbers.view(-1, *[1] * (grad.dim() - 1))
+
+    scale = per_row(unit[rows])
+    grad = grad * scale
+    first[rows] = mean = first[rows].lerp_(grad, 1 - beta)
+    second[rows] = square = second[rows].mul_(gamma).addcmul_(grad, grad, value=1 - gamma)
+    change = mean * per_row(corrections[0]) / (square * per_row(corrections[1])).sqrt_().add_(epsilon) * scale
+    value[rows] -= rate * change
