@@ -213,6 +213,7 @@ class FullSizeOptions:
         fold: leave out one view of this many at first; 0: none. Fewer than six views are never left out.
         opened: share of the stage after which all views are trained.
         geometry_every: as in :class:`RefineOptions`.
+        sh_degree: degree of the colours, if higher than the scene's; None: the scene's.
 
     Raises:
         ValueError: if an option is out of range.
@@ -232,6 +233,7 @@ class FullSizeOptions:
     fold: int = 16
     opened: float = 0.7
     geometry_every: int = 8
+    sh_degree: int | None = 2
 
     def __post_init__(self) -> None:
         for name, good, expected in (
@@ -249,6 +251,7 @@ class FullSizeOptions:
             ("fold", self.fold == 0 or self.fold >= 2, "0 or at least 2"),
             ("opened", 0 < self.opened < 1, "between 0 and 1"),
             ("geometry_every", self.geometry_every >= 1, "at least 1"),
+            ("sh_degree", self.sh_degree is None or 0 <= self.sh_degree <= MAX_DEGREE, f"0 to {MAX_DEGREE}, or null"),
         ):
             if not good:
                 raise ValueError(f"refine.full.{name} must be {expected}, got {getattr(self, name)}")

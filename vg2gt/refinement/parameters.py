@@ -51,6 +51,13 @@ class RefinedScene(TensorRecord):
         cameras = replace(self.cameras, world_to_camera=poses[None])
         return replace(self, gaussians=similarity.apply_gaussians(self.gaussians), cameras=cameras)
 
+    def with_degree(self, degree: int | None) -> RefinedScene:
+        """Returns the scene with colours of at least a degree of spherical harmonics; None: with its own."""
+        missing = 0 if degree is None else (degree + 1) ** 2 - self.gaussians.sh.shape[1]
+        if missing <= 0:
+            return self
+        return replace(self, gaussians=replace(self.gaussians, sh=F.pad(self.gaussians.sh, (0, 0, 0, missing))))
+
     def exposed(self, color: Tensor, views: Tensor) -> Tensor:
         """Applies the exposure of the views ``[R]`` to rendered colours ``[1, R, 3, H, W]``."""
         return color * self.gain[views, :, None, None] + self.bias[views, :, None, None]

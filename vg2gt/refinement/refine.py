@@ -189,7 +189,7 @@ class _Refinement:
         self.pixel = 1 / float(cameras.intrinsics[..., [0, 1], [0, 1]].mean())
         ones = torch.ones_like(seen.images[:, :, 0, 0])
         self.given, self.start = (
-            RefinedScene(_with_degree(each, options.sh_degree), cameras, ones, torch.zeros_like(ones)).detach()
+            RefinedScene(each, cameras, ones, torch.zeros_like(ones)).with_degree(options.sh_degree).detach()
             for each in (gaussians, start)
         )
         views = torch.arange(len(ones))
@@ -349,10 +349,3 @@ class ViewOrder:
         order = self.trained[torch.randperm(len(self.trained), generator=self._generator)]
         while True:
             yield from order.split(-(-len(order) // LEFT_OUT))
-
-
-def _with_degree(gaussians: Gaussians, degree: int | None) -> Gaussians:
-    missing = 0 if degree is None else (degree + 1) ** 2 - gaussians.sh.shape[1]
-    if missing <= 0:
-        return gaussians
-    return replace(gaussians, sh=torch.nn.functional.pad(gaussians.sh, (0, 0, 0, missing)))

@@ -117,7 +117,9 @@ class _Sharpening:
         # what was fitted at the working size is too small for them there, but not at much larger sizes
         self.given, self.renderer = renderer, replace(renderer, antialiased=True) if large else renderer
         self.poses = start.cameras
-        start = replace(start, cameras=self.photographs.cameras(start.cameras)).detach()
+        start = (
+            replace(start, cameras=self.photographs.cameras(start.cameras)).with_degree(self.full.sh_degree).detach()
+        )
         self.clock, self.began, self.seconds = clock, clock(), seconds
         self.views = trained
         self.fold = fold_of(trained, self.full)
