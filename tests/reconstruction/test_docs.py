@@ -72,8 +72,8 @@ def test_the_page_on_refinement(workplace: Path, monkeypatch, capsys: pytest.Cap
 
 def test_python_of_the_readme_and_the_reference(workplace: Path, capsys: pytest.CaptureFixture) -> None:
     """The README's runs twice, here on pictures with known cameras."""
-    (workplace / "photos").unlink()
-    (workplace / "photos").symlink_to(workplace / "recording")
+    (workplace / "examples").mkdir()
+    (workplace / "examples" / "photos").symlink_to(workplace / "recording")
     out = workplace / "outputs" / "python"
     for _ in range(2):
         (found,) = _examples("README.md")
