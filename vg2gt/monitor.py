@@ -27,7 +27,7 @@ class Monitor:
     Args:
         show: draw progress bars on the standard error stream.
         device: device to synchronise with and to measure the memory of.
-        watch: called after every step of a refinement with a function that returns the current scene; None: nobody
+        watch: called after every step of a refinement with a function that returns the current Gaussians and cameras; None: nobody
             watches (:class:`vg2gt.viewer.live.LiveView`).
 
     Attributes:

@@ -1,27 +1,24 @@
 """The page that shows a refinement: what viser is given, and how often."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from tests.io.gaussian_scenes import scene
-from vg2gt.refinement import RefinedScene
-from vg2gt.types import Cameras
+from vg2gt.types import Cameras, Gaussians
 from vg2gt.viewer import live
 from vg2gt.viewer.live import LiveView
 
 viser = pytest.importorskip("viser")
 
 
-def refined(count: int) -> RefinedScene:
+def refined(count: int) -> tuple[Gaussians, Cameras]:
     pose = torch.eye(4).repeat(1, 2, 1, 1)
     pose[0, 1, 0, 3] = -1.0  # the second camera is at x = 1
     intrinsics = torch.tensor([[50.0, 0, 31.5], [0, 50.0, 23.5], [0, 0, 1]]).expand(1, 2, 3, 3)
-    ones = torch.ones(2, 3)
-    return RefinedScene(scene(count, 1), Cameras(pose, intrinsics, (48, 64)), ones, torch.zeros_like(ones))
+    return scene(count, 1), Cameras(pose, intrinsics, (48, 64))
 
 
 def test_the_page_shows_the_last_scene_and_its_cameras(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -34,7 +31,7 @@ def test_the_page_shows_the_last_scene_and_its_cameras(monkeypatch: pytest.Monke
         handles = view.server.scene._handle_from_node_name
         splats = [handle for name, handle in handles.items() if name.startswith("/scene/")]
         assert [len(handle.centers) for handle in splats] == [30]
-        truth = refined(30).gaussians
+        truth = refined(30)[0]
         np.testing.assert_allclose(splats[0].centers, truth.means, rtol=1e-6)
         # the trace of a covariance is the sum of the squared standard deviations
         traces = np.trace(splats[0].covariances, axis1=1, axis2=2)
@@ -50,7 +47,7 @@ def test_it_is_not_updated_after_every_step() -> None:
     view, asked = LiveView(port=18431), []
     try:
         for _ in range(5):
-            view(lambda: asked.append(1) or replace(refined(4)))
+            view(lambda: asked.append(1) or refined(4))
         assert len(asked) == 1
     finally:
         view.close()

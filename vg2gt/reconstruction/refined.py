@@ -14,6 +14,8 @@ from vg2gt.reconstruction.policy import Quality, Refinement, chosen_refinement
 from vg2gt.reconstruction.surroundings import without_debris
 from vg2gt.refinement import Observations, RefineOptions, exposure_rates, fold_of, refine, sharpened, split_views
 from vg2gt.refinement.options import Observer, Progress
+from vg2gt.refinement.parameters import RefinedScene
+from vg2gt.types import Cameras, Gaussians
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -95,9 +97,13 @@ def _shown(advance: Callable[..., None], monitor: Monitor) -> Observer:
     def observe(progress: Progress) -> None:
         advance(100 * progress.share, f"{progress.psnr:.2f} dB")
         if monitor.watch is not None:
-            monitor.watch(progress.scene)
+            monitor.watch(lambda: _seen(progress.scene()))
 
     return observe
+
+
+def _seen(scene: RefinedScene) -> tuple[Gaussians, Cameras]:
+    return scene.gaussians, scene.cameras
 
 
 def refinement_figures(scene: Scene) -> dict[str, Any]:

@@ -13,7 +13,6 @@ from torch import Tensor
 from vg2gt.geometry.cameras import invert_rigid
 from vg2gt.geometry.rotations import matrix_to_quat, quat_to_matrix
 from vg2gt.geometry.spherical_harmonics import sh_to_rgb
-from vg2gt.refinement import RefinedScene
 from vg2gt.types import Cameras, Gaussians
 
 _INTERVAL = 5.0  # seconds between two updates, which take time from the refinement
@@ -46,14 +45,14 @@ class LiveView:
         """Address of the page."""
         return f"http://127.0.0.1:{self.server.get_port()}"
 
-    def __call__(self, scene: Callable[[], RefinedScene]) -> None:
-        """Shows the scene that a function returns, unless the page was updated a moment ago."""
+    def __call__(self, scene: Callable[[], tuple[Gaussians, Cameras]]) -> None:
+        """Shows the Gaussians and cameras that a function returns, unless the page was updated a moment ago."""
         if time.monotonic() < self._last + _INTERVAL:
             return
-        now = scene()
+        gaussians, cameras = scene()
         if self._shown is None:
-            self._draw_cameras(now.cameras)
-        before, self._shown = self._shown, self._draw(now.gaussians)
+            self._draw_cameras(cameras)
+        before, self._shown = self._shown, self._draw(gaussians)
         if before is not None:
             before.remove()
         self._last = time.monotonic()
