@@ -10,6 +10,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from tests.geometry.test_geodesy import on_earth, with_gps
 from tests.inputs.test_given_cameras import put_cameras, put_colmap
 from tests.reconstruction.conftest import SIZE, run
 from vg2gt import io
@@ -62,6 +63,29 @@ def test_metric_cameras_give_metres(recording: Path, ready, monkeypatch) -> None
     upright = reconstruct_with(ready.model, recording)
     assert upright.metres_per_unit == pytest.approx(upright.frame.scale)
     assert upright.metres_per_unit != pytest.approx(1, abs=0.01)
+
+
+def test_gps_gives_metres_and_up(folder: Path, frames, tmp_path: Path, monkeypatch, capsys) -> None:
+    """Cameras of an aeroplane look down: what they have below them is not gravity."""
+    put_colmap(folder, frames)
+    monkeypatch.setattr("vg2gt.inputs.camera_source.SFM_SOURCE", "COLMAP")
+    centers = io.invert_pose(frames.world_to_camera.double().numpy())[:, :3, 3]
+    to_enu = 37 * Rotation.from_euler("x", 180, degrees=True).as_matrix()  # the room's z is down
+    for file, place in zip(sorted((folder / "images").iterdir()), on_earth(centers @ to_enu.T), strict=True):
+        with_gps(file, place)
+    run(folder, "--out", tmp_path / "out", "--save", "scene.ply,cameras.json,report.json,views.npz")
+    assert "GPS of 4 photographs" in capsys.readouterr().out
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    scene = read_scene(tmp_path / "out", Renderer())
+    assert scene.frame is not None
+    assert scene.frame.world_place is not None
+    assert scene.metres_per_unit == pytest.approx(37 * scene.frame.scale, rel=0.01)
+    np.testing.assert_allclose(scene.frame.world_place.to_enu, report["gps"]["to_enu"], atol=1e-6)
+    np.testing.assert_allclose(report["gps"]["up"], [0, -1, 0], atol=1e-6)
+    assert report["gps"]["origin"][0] == pytest.approx(46.84, abs=0.01)
+    found = io.invert_pose(scene.poses.numpy())[:, :3, 3] @ np.array(report["gps"]["to_enu"])[:3, :3].T
+    known = centers @ to_enu.T
+    np.testing.assert_allclose(found - found[0], known - known[0], atol=0.02 * np.ptp(known))
 
 
 def test_map_coordinates_keep_their_digits(folder: Path, frames, model, caplog) -> None:

@@ -84,6 +84,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     from vg2gt.memory import RECONSTRUCTION, memory_advice
     from vg2gt.monitor import Monitor
     from vg2gt.outputs.outputs import cost_figures, write_outputs
+    from vg2gt.reconstruction.frame import place_lines
     from vg2gt.reconstruction.refined import refinement_lines
     from vg2gt.reconstruction.trust import trust_lines, trusted
     from vg2gt.reconstruction.windows.store import remove, tidy
@@ -132,7 +133,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     print(f"{len(scene.names)} images of {height}x{width}: {len(scene.gaussians)} Gaussians")
     if scene.refined is not None:
         print(*refinement_lines(scene), sep="\n")
-    print(*trust_lines(scene), sep="\n")
+    print(*trust_lines(scene), *place_lines(scene), sep="\n")
     print(f"weights: {figures['weights']}; cameras: {scene.cameras_from or PREDICTED}")
     print(f"seconds: {times}; peak memory {cost['peak_memory_mib']} MiB")
     print(f"written: {', '.join(str(folder / name) for name in options.save)}")

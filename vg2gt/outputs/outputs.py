@@ -38,6 +38,7 @@ from vg2gt.io.video import video_writer
 from vg2gt.monitor import Monitor
 from vg2gt.outputs.export import exported_views
 from vg2gt.outputs.output_names import DEFAULT, MAPS, OUTPUTS, PREDICTED
+from vg2gt.reconstruction.frame import place_figures
 from vg2gt.reconstruction.refined import refinement_figures
 from vg2gt.reconstruction.trust import trust_figures, trust_picture
 from vg2gt.viewer import ViewerScene, scene_title, thumbnail, write_viewer_html
@@ -172,6 +173,7 @@ def scene_figures(scene: Scene) -> dict[str, Any]:
         **trust_figures(scene),
         "cameras": scene.cameras_from or PREDICTED,
         **({} if scene.frame is None else {"frame": scene.frame.name, "to_source": scene.frame.to_source.tolist()}),
+        **place_figures(scene.frame),
     }
 
 

@@ -16,7 +16,7 @@ from vg2gt.io.cameras_json import NamedCamera
 from vg2gt.io.errors import FormatError
 from vg2gt.io.files import read_json
 from vg2gt.outputs.output_names import PREDICTED
-from vg2gt.reconstruction.frame import SceneFrame
+from vg2gt.reconstruction.frame import SceneFrame, read_place
 from vg2gt.reconstruction.scene import Scene
 from vg2gt.rendering import Renderer
 from vg2gt.types import Cameras
@@ -61,7 +61,9 @@ def read_scene(folder: str | Path, renderer: Renderer, device: torch.device | st
         renderer=renderer_of(folder, renderer),
         metres_per_unit=report.get("metres_per_unit") if metres is None else metres,
         cameras_from="" if cameras_from == PREDICTED else cameras_from,
-        frame=None if similarity is None else SceneFrame(frame, similarity, None, frame),
+        frame=None
+        if similarity is None
+        else SceneFrame(frame, similarity, None, frame, read_place(report, similarity)),
         poses=poses,
     )
 

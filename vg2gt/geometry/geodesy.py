@@ -1,0 +1,119 @@
+"""Positions on the Earth: latitude, longitude and altitude in metres; the place of a scene by its cameras' GPS."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from vg2gt.geometry.alignment import align_points
+
+_EQUATOR, _FLATTENING = 6378137.0, 1 / 298.257223563  # WGS 84, radius in metres
+_FEWEST = 4  # positions
+_DRAWS = 300
+_WITHIN = 3.0  # median distances up to which a position counts
+_COARSE = 0.05  # largest relative error of the scale
+_LINE = 0.02  # width of the cameras' path, relative to its length, up to which it is a line
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """Where cameras are on the Earth.
+
+    Attributes:
+        to_enu: ``[4, 4]`` float64 similarity from the cameras' world to metres east, north and up of the origin.
+        origin: latitude and longitude in degrees (WGS 84), altitude in metres.
+        error: median distance between the cameras and their measured positions, in metres.
+        scale_error: estimated relative standard error of the scale.
+        used: number of positions that agree.
+        is_level: whether the positions determine the direction up; cameras on one line do not.
+    """
+
+    to_enu: NDArray[np.float64]
+    origin: tuple[float, float, float]
+    error: float
+    scale_error: float
+    used: int
+    is_level: bool
+
+    @property
+    def scale(self) -> float:
+        """Metres per unit of the cameras' world."""
+        return float(np.cbrt(np.linalg.det(self.to_enu[:3, :3])))
+
+    @property
+    def up(self) -> NDArray[np.float64]:
+        """Direction up ``[3]`` in the cameras' world, of length 1."""
+        return self.to_enu[2, :3] / self.scale
+
+
+def enu(positions: NDArray[np.float64], origin: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Converts positions to metres east, north and up of an origin.
+
+    Args:
+        positions: ``[N, 3]`` latitude and longitude in degrees (WGS 84), altitude in metres.
+        origin: ``[3]``, likewise.
+
+    Returns:
+        ``[N, 3]``.
+    """
+    # Rows turn Earth-centred axes about the poles by the longitude, then to the horizon by the latitude.
+    turn = Rotation.from_euler("zy", [origin[1], -origin[0]], degrees=True).as_matrix()
+    up_east_north = (_earth_centred(positions) - _earth_centred(origin[None])) @ turn
+    return up_east_north[:, [1, 2, 0]]
+
+
+def fit_place(centers: NDArray[np.float64], positions: NDArray[np.float64]) -> Place | None:
+    """Fits a similarity from camera centres to measured positions; outliers do not count.
+
+    Candidates are the similarities of three cameras each; the one with the least median distance is fitted again to all
+    positions within three times that distance.
+
+    Args:
+        centers: ``[N, 3]`` in the cameras' world.
+        positions: ``[N, 3]`` latitude, longitude, altitude; NaN where unknown.
+
+    Returns:
+        The place; None if there are fewer than four positions, or they are too coarse for the cameras' distances: the
+        relative error of the scale would exceed 5 %.
+    """
+    known = np.isfinite(positions).all(1)
+    if known.sum() < _FEWEST:
+        return None
+    origin = np.median(positions[known], 0)
+    source, target = (torch.from_numpy(each) for each in (centers[known], enu(positions[known], origin)))
+    generator = torch.Generator().manual_seed(0)
+    draws = torch.stack([torch.randperm(len(source), generator=generator)[:3] for _ in range(_DRAWS)])
+    candidates = align_points(source[draws], target[draws])
+    distances = (candidates.apply(source.expand(_DRAWS, -1, -1)) - target).norm(dim=-1)
+    distance = distances[distances.median(1).values.nan_to_num(torch.inf).argmin()]
+    near = distance <= _WITHIN * distance.median()
+    for _ in range(3):
+        fit = align_points(source[None, near], target[None, near])
+        distance = (fit.apply(source[None]) - target).norm(dim=-1)[0]
+        near = distance <= _WITHIN * distance.median()
+    spread = torch.linalg.svdvals(target[near] - target[near].mean(0))
+    scale_error = float(distance[near].square().mean().sqrt() / spread[:2].norm())
+    if not scale_error <= _COARSE:
+        return None
+    matrix = np.eye(4)
+    matrix[:3, :3] = float(fit.scale[0]) * fit.rotation[0].numpy()
+    matrix[:3, 3] = fit.translation[0].numpy()
+    is_level = bool(spread[1] > max(_LINE * float(spread[0]), 2 * scale_error * float(spread[0])))
+    latitude, longitude, altitude = origin.tolist()
+    return Place(
+        matrix, (latitude, longitude, altitude), float(distance[near].median()), scale_error, int(near.sum()), is_level
+    )
+
+
+def _earth_centred(positions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Converts latitude, longitude and altitude ``[N, 3]`` to metres from the Earth's centre."""
+    latitude, longitude, altitude = np.radians(positions[:, 0]), np.radians(positions[:, 1]), positions[:, 2]
+    squared = _FLATTENING * (2 - _FLATTENING)  # eccentricity
+    radius = _EQUATOR / np.sqrt(1 - squared * np.sin(latitude) ** 2)
+    across = (radius + altitude) * np.cos(latitude)
+    polar = (radius * (1 - squared) + altitude) * np.sin(latitude)
+    return np.stack([across * np.cos(longitude), across * np.sin(longitude), polar], 1)
