@@ -25,6 +25,7 @@ from vg2gt.io import (
     fuse_depth,
     write_cameras_json,
     write_colmap,
+    write_gaussian_gltf,
     write_gaussian_ply,
     write_mesh,
     write_point_ply,
@@ -348,6 +349,9 @@ def _target(output: str) -> str:
 _WRITERS: dict[str, Callable[[Scene, Path], Any]] = {
     "scene.ply": _scene_ply,
     "scene.spz": lambda scene, path: write_spz(path, scene.gaussians, scene.renderer.antialiased),
+    "scene.glb": lambda scene, path: write_gaussian_gltf(path, scene.gaussians),
+    "scene.gltf": lambda scene, path: write_gaussian_gltf(path, scene.gaussians),
+    "scene.spz.glb": lambda scene, path: write_gaussian_gltf(path, scene.gaussians, True, scene.renderer.antialiased),
     "scene.html": _page,
     "tiles": _tiles,
     "cameras.json": lambda scene, path: write_cameras_json(path, scene.named_cameras()),

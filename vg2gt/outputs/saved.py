@@ -15,6 +15,7 @@ from vg2gt.io.arrays import read_npz
 from vg2gt.io.cameras_json import NamedCamera
 from vg2gt.io.errors import FormatError
 from vg2gt.io.files import read_json
+from vg2gt.io.gaussian_files import READERS
 from vg2gt.outputs.output_names import PREDICTED
 from vg2gt.reconstruction.frame import SceneFrame, read_place
 from vg2gt.reconstruction.scene import Scene
@@ -72,15 +73,15 @@ def scene_file(path: str | Path) -> Path:
     """Returns the scene's file if ``path`` is the folder of a scene, else ``path`` itself.
 
     Raises:
-        FileNotFoundError: if the folder has neither ``scene.ply`` nor ``scene.spz``.
+        FileNotFoundError: if the folder has no scene.
     """
     path = Path(path).expanduser()
     if not path.is_dir():
         return path
-    for name in ("scene.ply", "scene.spz"):
+    for name in (f"scene{suffix}" for suffix in READERS):
         if (path / name).is_file():
             return path / name
-    raise FileNotFoundError(f"{path} has no scene.ply or scene.spz: give a scene's file or a folder with one")
+    raise FileNotFoundError(f"{path} has no scene.ply: give a scene's file or a folder with one")
 
 
 def renderer_of(folder: Path, renderer: Renderer) -> Renderer:
