@@ -12,7 +12,7 @@ ORIGIN = np.array([46.8425, -91.9945, 198.3])
 
 
 def on_earth(metres: np.ndarray) -> np.ndarray:
-    """Latitude, longitude and altitude of ``[N, 3]`` metres east, north, up of the origin, by the radii of curvature."""
+    """Latitude, longitude and altitude of metres ``[N, 3]`` east, north, up of the origin, by radii of curvature."""
     squared, sine = 0.00669437999014, np.sin(np.radians(ORIGIN[0]))
     across = 6378137 / np.sqrt(1 - squared * sine**2)
     along = across * (1 - squared) / (1 - squared * sine**2)

@@ -14,6 +14,7 @@ from tests.geometry.test_geodesy import on_earth, with_gps
 from tests.inputs.test_given_cameras import put_cameras, put_colmap
 from tests.reconstruction.conftest import SIZE, run
 from vg2gt import io
+from vg2gt.cli import place
 from vg2gt.geometry.cameras import project
 from vg2gt.inputs.given_cameras import given_pictures
 from vg2gt.outputs.saved import read_scene
@@ -138,3 +139,29 @@ def test_own_cameras_serve_the_original_photographs(folder: Path, frames, tmp_pa
     assert loaded.images.shape[-2:] == SIZE
     assert torch.allclose(loaded.intrinsics[0], frames.intrinsics[2], atol=1e-3)
     assert torch.allclose(loaded.world_to_camera[0], frames.world_to_camera[2], atol=1e-6)
+
+
+def test_two_points_or_control_points_place_a_scene(folder: Path, frames, tmp_path: Path, capsys) -> None:
+    put_colmap(folder, frames)
+    out = tmp_path / "out"
+    run(folder, "--out", out, "--save", "cameras.json,scene.ply,report.json,views.npz")
+    place.main([str(out), "--scale", "0,0,1,0.3,0.4,1=120cm"])
+    assert "is 2.4 m" in capsys.readouterr().out
+    assert read_scene(out, Renderer()).metres_per_unit == pytest.approx(2.4)
+    assert json.loads((out / "report.json").read_text())["metres_per_unit"] == pytest.approx(2.4)
+    for wrong in ("0,0,1=1m", "0,0,1,0,0,1=1m", "0,0,1,0,0,2=1", "0,0,1,0,0,2=-1m", "0,0,1,0,0,nan=1m"):
+        with pytest.raises(SystemExit):
+            place.main([str(out), f"--scale={wrong}"])
+    points = np.array([[0, 0, 0], [4, 0, 0], [0, 0, 5], [4, 1, 5.0]])
+    to_enu = 11 * Rotation.from_euler("x", 90, degrees=True).as_matrix()
+    np.savetxt(tmp_path / "control.csv", np.hstack([points, on_earth(points @ to_enu.T)]), delimiter=",", fmt="%.12f")
+    place.main([str(out), "--control", str(tmp_path / "control.csv")])
+    scene = read_scene(out, Renderer())
+    assert scene.metres_per_unit == pytest.approx(11, rel=1e-3)
+    assert scene.frame is not None
+    assert scene.frame.world_place is not None
+    np.testing.assert_allclose(scene.frame.world_place.up, [0, -1, 0], atol=1e-3)
+    (tmp_path / "control.csv").write_text("1,2,3,4,5,6\n")
+    with pytest.raises(SystemExit):
+        place.main([str(out), "--control", str(tmp_path / "control.csv")])
+    assert "three or more" in capsys.readouterr().err

@@ -70,6 +70,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     add("--drop", type=list_of_names, default=[], metavar="LIST", help="drop Gaussians by status, a list of: guessed, "
         "contradicted, single (seen by one view), unseen")  # fmt: skip
     add("--watch", action="store_true", help=WATCH)
+    add("--object", action="store_true", help="keep only the object that the cameras look at, without surroundings")
     add_common_flags(arguments, DEFAULT)
     given, overrides = separate(argv)
     options = arguments.parse_args(given)
@@ -105,6 +106,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
             ready = load(options.ckpt, overrides=overrides, device=options.device)
         scene = _scene(options, ready, how_to_refine, monitor)
         scene = trusted(scene, options.min_confidence, options.drop)
+        scene = scene.cut_to_object() if options.object else scene
         if len(scene.gaussians) > LARGE and TILES not in options.save:
             options.save.append(TILES)
         trained = bool(ready.model.trained_parameters())

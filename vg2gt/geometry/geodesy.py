@@ -95,18 +95,29 @@ def fit_place(centers: NDArray[np.float64], positions: NDArray[np.float64]) -> P
         fit = align_points(source[None, near], target[None, near])
         distance = (fit.apply(source[None]) - target).norm(dim=-1)[0]
         near = distance <= _WITHIN * distance.median()
-    spread = torch.linalg.svdvals(target[near] - target[near].mean(0))
-    scale_error = float(distance[near].square().mean().sqrt() / spread[:2].norm())
-    if not scale_error <= _COARSE:
-        return None
+    place = place_of_points(source[near].numpy(), positions[known][near.numpy()])
+    return place if place.scale_error <= _COARSE else None
+
+
+def place_of_points(points: NDArray[np.float64], positions: NDArray[np.float64]) -> Place:
+    """Fits a similarity from at least three points to their positions, all of which count.
+
+    Args:
+        points: ``[N, 3]``.
+        positions: ``[N, 3]`` latitude, longitude, altitude of the same points.
+    """
+    origin = np.median(positions, 0)
+    source, target = torch.from_numpy(points), torch.from_numpy(enu(positions, origin))
+    fit = align_points(source[None], target[None])
+    distance = (fit.apply(source[None]) - target).norm(dim=-1)[0]
+    spread = torch.linalg.svdvals(target - target.mean(0))
+    scale_error = float(distance.square().mean().sqrt() / spread[:2].norm()) if spread[0] > 0 else float("inf")
     matrix = np.eye(4)
     matrix[:3, :3] = float(fit.scale[0]) * fit.rotation[0].numpy()
     matrix[:3, 3] = fit.translation[0].numpy()
-    is_level = bool(spread[1] > max(_LINE * float(spread[0]), 2 * scale_error * float(spread[0])))
+    is_level = bool(spread[1] > max(_LINE, 2 * scale_error) * spread[0])
     latitude, longitude, altitude = origin.tolist()
-    return Place(
-        matrix, (latitude, longitude, altitude), float(distance[near].median()), scale_error, int(near.sum()), is_level
-    )
+    return Place(matrix, (latitude, longitude, altitude), float(distance.median()), scale_error, len(points), is_level)
 
 
 def _earth_centred(positions: NDArray[np.float64]) -> NDArray[np.float64]:
