@@ -19,8 +19,8 @@ def orbit(target: np.ndarray, turned: float = 0.0) -> Cameras:
     """Twelve cameras at a distance of 3, 1 above; turned away from the target by an angle."""
     poses = []
     for angle in np.arange(12) * math.pi / 6:
-        center = target + [3 * math.sin(angle), -1, -3 * math.cos(angle)]
-        aim = center + [-math.sin(angle + turned), 0.3, math.cos(angle + turned)]
+        center = target + np.array([3 * math.sin(angle), -1, -3 * math.cos(angle)])
+        aim = center + np.array([-math.sin(angle + turned), 0.3, math.cos(angle + turned)])
         poses.append(look_at(center, aim, np.array([0.0, 1, 0])))
     intrinsics = torch.tensor([[60.0, 0, 31.5], [0, 60, 23.5], [0, 0, 1]])
     return Cameras(torch.from_numpy(np.stack(poses)).float()[None], intrinsics.expand(1, 12, 3, 3).clone(), SIZE)

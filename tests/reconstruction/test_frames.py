@@ -72,8 +72,8 @@ def test_gps_gives_metres_and_up(folder: Path, frames, tmp_path: Path, monkeypat
     monkeypatch.setattr("vg2gt.inputs.camera_source.SFM_SOURCE", "COLMAP")
     centers = io.invert_pose(frames.world_to_camera.double().numpy())[:, :3, 3]
     to_enu = 37 * Rotation.from_euler("x", 180, degrees=True).as_matrix()  # the room's z is down
-    for file, place in zip(sorted((folder / "images").iterdir()), on_earth(centers @ to_enu.T), strict=True):
-        with_gps(file, place)
+    for file, position in zip(sorted((folder / "images").iterdir()), on_earth(centers @ to_enu.T), strict=True):
+        with_gps(file, position)
     run(folder, "--out", tmp_path / "out", "--save", "scene.ply,cameras.json,report.json,views.npz")
     assert "GPS of 4 photographs" in capsys.readouterr().out
     report = json.loads((tmp_path / "out" / "report.json").read_text())

@@ -8,11 +8,15 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vg2gt.cli.arguments import flag_parser
 from vg2gt.cli.errors import errors_in_one_line
+
+if TYPE_CHECKING:
+    from vg2gt.geometry.geodesy import Place
 
 _UNITS = {"mm": 0.001, "cm": 0.01, "m": 1.0, "km": 1000.0, "in": 0.0254, "ft": 0.3048}
 _SCALE = re.compile(rf"(.+)=\s*([\d.eE+-]+)\s*({'|'.join(_UNITS)})")
@@ -24,8 +28,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     add = parser.add_argument
     add("scene", type=Path, metavar="DIR", help="a folder that vg2gt reconstruct has written")
     how = parser.add_mutually_exclusive_group(required=True).add_argument
-    how("--scale", type=_scale, metavar="X,Y,Z,X,Y,Z=1.2m", help="two points of the scene, as the page's Measure copies "
-        f"them, and the distance between them in {', '.join(_UNITS)}")  # fmt: skip
+    how("--scale", type=_scale, metavar="A,B=1.2m", help="two points of the scene, as the page's Measure shows "
+        f"them, and their distance in {', '.join(_UNITS)}")  # fmt: skip
     how("--control", type=Path, metavar="FILE", help="control points: a CSV with a line x,y,z,latitude,longitude,"
         "altitude for each of three or more points, in the scene's frame, degrees and metres")  # fmt: skip
     with errors_in_one_line():
@@ -69,18 +73,18 @@ def _scale(text: str) -> float:
     return length / distance
 
 
-def _control(file: Path):
-    from vg2gt.geometry.geodesy import Place, place_of_points
+def _control(file: Path) -> Place:
+    """Returns the place that a file of control points gives."""
+    from vg2gt.geometry.geodesy import place_of_points
 
+    expected = f"{file}: expected three or more lines x,y,z,latitude,longitude,altitude"
     try:
         rows = np.loadtxt(file, delimiter=",", ndmin=2)
     except ValueError as error:
-        raise ValueError(
-            f"{file}: expected lines of six numbers x,y,z,latitude,longitude,altitude ({error})"
-        ) from error
+        raise ValueError(f"{expected} ({error})") from error
     if rows.shape[1] != 6 or len(rows) < 3 or not np.isfinite(rows).all():
-        raise ValueError(f"{file}: expected three or more lines x,y,z,latitude,longitude,altitude, got {rows.shape}")
-    place: Place = place_of_points(rows[:, :3], rows[:, 3:])
+        raise ValueError(f"{expected}, got {len(rows)} of {rows.shape[1]} numbers")
+    place = place_of_points(rows[:, :3], rows[:, 3:])
     if not place.is_level:
         raise ValueError(f"{file}: the control points are on one line, or do not fit each other ({place.error:.3g} m)")
     return place
