@@ -67,6 +67,7 @@ class Picture:
         container: the video or panorama that it is a part of; None: none.
         is_metric: whether its camera (and depth) is in metres.
         lens: lens that its file was undistorted from (``undistortion.lens_text``); empty for a pinhole image.
+        whole: the picture without the padding of this one; None: it is not padded.
     """
 
     name: str
@@ -83,6 +84,7 @@ class Picture:
     container: Path | None = None
     is_metric: bool = False
     lens: str = ""
+    whole: Picture | None = None
 
 
 def find_pictures(images: ImagesLike, max_images: int | None = None) -> list[Picture]:

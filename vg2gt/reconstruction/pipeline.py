@@ -21,6 +21,7 @@ from vg2gt.inputs.camera_source import CameraSource
 from vg2gt.inputs.cameras import Poses, pictures_for
 from vg2gt.inputs.folders import is_photo
 from vg2gt.inputs.inputs import Views, as_given, in_order, load_views, source_of, working_order, working_size
+from vg2gt.inputs.padding import padded
 from vg2gt.inputs.pictures import ImagesLike, Picture
 from vg2gt.io.files import by_number
 from vg2gt.io.image_files import gps_position
@@ -100,6 +101,7 @@ def reconstruct_with(
     with memory_advice(RECONSTRUCTION), chosen as pictures:
         sizes = [picture.size for picture in pictures]
         target = anchor.size if anchor else working_size(sizes, model.backend.patch_size, device_of(model).type, size)
+        pictures = [padded(picture, target) for picture in pictures]
         note_sizes({f"images of {target[0]}x{target[1]}": len(pictures)})
         if images_at_a_time := window_size(window, len(pictures), keep_windows or anchor is not None):
             # memory-mapped files stay readable after their removal
