@@ -118,7 +118,7 @@ def test_measuring_cropping_and_views_to_keep() -> None:
         answer = {{
           text: measured([[0, 0, 1], [0.3, 0.4, 1]], null), metres: measured([[0, 0, 1], [0.3, 0.4, 1]], 2.4),
           whole: cropBox([0, 200, 0, 200, 0, 200], [[0, 1], [0, 1], [0, 1]]),
-          half: cropBox([0, 100, 0, 200, 50, 200], [[0, 1], [0, 1], [0, 8]]).map((v) => (Number.isFinite(v) ? v : null)),
+          half: cropBox([0, 100, 0, 200, 50, 200], [[0, 1], [0, 1], [0, 8]]).map((v) => Number.isFinite(v) ? v : null),
           orders: [order(null), order([-1, -1, 1.5, 1, 1, 9])], back, axes: view.axes,
         }};""")
     assert answer["text"] == "0.5 scene units. To set the scale: vg2gt place DIR --scale=0,0,1,0.3,0.4,1=LENGTHm"
