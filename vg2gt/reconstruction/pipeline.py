@@ -158,8 +158,9 @@ def _scene(parts: _Parts, pictures: Sequence[Picture], renderer: Renderer, is_me
     target = "given" if CameraSource.of(source) in (CameraSource.GIVEN, CameraSource.RECORDED) else "upright"
     frame = first_frame(geometry.cameras, float(parts.unit), given, target)
     if parts.to_source is not None:
-        frame = replace(frame, to_source=parts.to_source)  # same for all sets
-    frame = replace(frame, place=_place(geometry.cameras, frame, pictures))
+        frame = replace(frame, to_source=parts.to_source)  # same for all sets, and their place is that of the first
+    else:
+        frame = replace(frame, place=_place(geometry.cameras, frame, pictures))
     metres = frame.scale if pictures[0].is_metric else None
     if frame.world_place is not None and metres is None:
         metres = frame.world_place.scale
@@ -285,6 +286,8 @@ def _joined(old: Scene, new: Scene) -> Scene:
         mask=None if old.mask is None and new.mask is None else both(*masks),
         names=(*old.names, *new.names),
         renderer=old.renderer,
+        metres_per_unit=old.metres_per_unit,
+        frame=new.frame if new.frame is None or old.frame is None else replace(new.frame, place=old.frame.place),
         poses=None if old.poses is None or new.poses is None else both(old.poses, new.poses),
         **{name: both(getattr(old, name), getattr(new, name)) for name in ("images", "depth", "depth_conf")},
     )
