@@ -16,7 +16,8 @@ _FEWEST = 4  # positions
 _DRAWS = 300
 _WITHIN = 3.0  # median distances up to which a position counts
 _COARSE = 0.05  # largest relative error of the scale
-_LINE = 0.02  # width of the cameras' path, relative to its length, up to which it is a line
+_LINE = 1e-3  # width of the positions, relative to their length, up to which they are on a line
+_TILT = 0.05  # largest standard error of the turn about that line, in radians
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,8 +61,8 @@ def enu(positions: NDArray[np.float64], origin: NDArray[np.float64]) -> NDArray[
     Returns:
         ``[N, 3]``.
     """
-    # Rows turn Earth-centred axes about the poles by the longitude, then to the horizon by the latitude.
-    turn = Rotation.from_euler("zy", [origin[1], -origin[0]], degrees=True).as_matrix()
+    # its columns are up, east and north
+    turn = Rotation.from_euler("ZY", [origin[1], -origin[0]], degrees=True).as_matrix()
     up_east_north = (_earth_centred(positions) - _earth_centred(origin[None])) @ turn
     return up_east_north[:, [1, 2, 0]]
 
@@ -115,7 +116,8 @@ def place_of_points(points: NDArray[np.float64], positions: NDArray[np.float64])
     matrix = np.eye(4)
     matrix[:3, :3] = float(fit.scale[0]) * fit.rotation[0].numpy()
     matrix[:3, 3] = fit.translation[0].numpy()
-    is_level = bool(spread[1] > max(_LINE, 2 * scale_error) * spread[0])
+    noise = float(distance.square().mean().sqrt()) / 3**0.5  # along an axis
+    is_level = bool(spread[1] > max(_LINE * float(spread[0]), noise / _TILT))
     latitude, longitude, altitude = origin.tolist()
     return Place(matrix, (latitude, longitude, altitude), float(distance.median()), scale_error, len(points), is_level)
 
