@@ -10,8 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from vg2gt.cli.arguments import flag_parser
 from vg2gt.cli.errors import errors_in_one_line
 
@@ -38,6 +36,8 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Changes ``cameras.json`` and ``report.json``; the Gaussians stay as they are."""
+    import numpy as np
+
     from vg2gt.io import read_cameras_json, write_cameras_json
     from vg2gt.io.files import read_json, write_json
     from vg2gt.reconstruction.frame import SceneFrame, place_figures
@@ -75,6 +75,8 @@ def _scale(text: str) -> float:
 
 def _control(file: Path) -> Place:
     """Returns the place that a file of control points gives."""
+    import numpy as np
+
     from vg2gt.geometry.geodesy import place_of_points
 
     expected = f"{file}: expected three or more lines x,y,z,latitude,longitude,altitude"
