@@ -10,10 +10,12 @@ from PIL import Image
 
 from tests.inputs.test_given_cameras import NAMES, put_cameras
 from vg2gt import io
+from vg2gt.data.sources.sparse_points import ObservedPoints
 from vg2gt.geometry.cameras import project
 from vg2gt.inputs.given_cameras import given_pictures
 from vg2gt.inputs.inputs import load_views, photo_of, working_size
 from vg2gt.inputs.padding import PADDED, padded, without_padding
+from vg2gt.inputs.pictures import Picture
 from vg2gt.io.cameras_json import NamedCamera
 from vg2gt.monitor import Monitor
 from vg2gt.reconstruction.pipeline import reconstruct_with
@@ -61,6 +63,15 @@ def test_nothing_is_cropped_and_cameras_fit(mixed: Path, frames) -> None:
         photo = photo_of(named, whole[view])
         assert (photo.height, photo.width) == picture.size
         np.testing.assert_allclose(photo.intrinsics, frame.intrinsics[0], atol=0.6)
+
+
+def test_sparse_points_move_with_the_picture() -> None:
+    points = ObservedPoints(np.arange(2), np.array([[0.0, 0.0], [0.5, 1.0]], np.float32), np.ones(2, np.float32))
+    picture = Picture("a", (100, 50), lambda size: None, points=points)  # type: ignore[arg-type]
+    found = padded(picture, (84, 112)).points
+    assert found is not None
+    # 133 pixels wide, 41 of them before the picture
+    np.testing.assert_allclose(found.places, [[41 / 133, 0], [66 / 133, 1]], atol=1e-6)
 
 
 def test_the_scene_goes_on_behind_the_padding(mixed: Path, model, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional as F
@@ -30,12 +31,15 @@ def padded(picture: Picture, shape: tuple[int, int]) -> Picture:
         inner = (round(wanted[0] * picture.size[0] / size[0]), round(wanted[1] * picture.size[1] / size[1]))
         return _padded_frames(picture.read((max(inner[0], 1), max(inner[1], 1))), picture.size, size)
 
-    size = _canvas(picture.size, shape)
-    matrix = picture.intrinsics
+    size, matrix, points = _canvas(picture.size, shape), picture.intrinsics, picture.points
+    corner = np.array([(size[1] - picture.size[1]) // 2, (size[0] - picture.size[0]) // 2])
     if matrix is not None:
         matrix = matrix.copy()
-        matrix[:2, 2] += [(size[1] - picture.size[1]) // 2, (size[0] - picture.size[0]) // 2]
-    return replace(picture, size=size, read=read, intrinsics=matrix, whole=picture)
+        matrix[:2, 2] += corner
+    if points is not None:
+        places = (points.places * picture.size[::-1] + corner) / size[::-1]
+        points = replace(points, places=places.astype(points.places.dtype))
+    return replace(picture, size=size, read=read, intrinsics=matrix, points=points, whole=picture)
 
 
 def without_padding(mask: Tensor) -> Tensor:
