@@ -66,7 +66,7 @@ def test_nothing_is_cropped_and_cameras_fit(mixed: Path, frames) -> None:
 
 
 def test_sparse_points_move_with_the_picture() -> None:
-    points = ObservedPoints(np.arange(2), np.array([[0.0, 0.0], [0.5, 1.0]], np.float32), np.ones(2, np.float32))
+    points = ObservedPoints(np.arange(2), np.array([[0.0, 0.0], [0.5, 1.0]]), np.ones(2, np.float32))
     picture = Picture("a", (100, 50), lambda size: None, points=points)  # type: ignore[arg-type]
     found = padded(picture, (84, 112)).points
     assert found is not None

@@ -38,7 +38,7 @@ def padded(picture: Picture, shape: tuple[int, int]) -> Picture:
         matrix[:2, 2] += corner
     if points is not None:
         places = (points.places * picture.size[::-1] + corner) / size[::-1]
-        points = replace(points, places=places.astype(points.places.dtype))
+        points = replace(points, places=places)
     return replace(picture, size=size, read=read, intrinsics=matrix, points=points, whole=picture)
 
 
