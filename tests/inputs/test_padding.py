@@ -56,9 +56,10 @@ def test_nothing_is_cropped_and_cameras_fit(mixed: Path, frames) -> None:
         frame = picture.read(picture.size)
         own = replace(pose, intrinsics=frame.intrinsics[None], size=picture.size)
         (u, v) = project(point, own)[0][0, 0, 0].tolist()
-        color = views.images[view, :, round(y) - 1 : round(y) + 2, round(x) - 1 : round(x) + 2].mean((1, 2))
-        expected = frame.images[0, :, round(v) - 1 : round(v) + 2, round(u) - 1 : round(u) + 2].mean((1, 2))
-        assert (color - expected).abs().max() < 0.08
+        reach = round(6 * min(size[0] / whole[view].size[0], size[1] / whole[view].size[1]))
+        color = views.images[view, :, round(y) - reach : round(y) + reach + 1, round(x) - reach : round(x) + reach + 1]
+        expected = frame.images[0, :, round(v) - 6 : round(v) + 7, round(u) - 6 : round(u) + 7]
+        assert (color.mean((1, 2)) - expected.mean((1, 2))).abs().max() < 0.04
         named = NamedCamera("a", size[1], size[0], camera.intrinsics[0, 0].double().numpy(), np.eye(4))
         photo = photo_of(named, whole[view])
         assert (photo.height, photo.width) == picture.size
@@ -78,7 +79,7 @@ def test_the_scene_goes_on_behind_the_padding(mixed: Path, model, tmp_path: Path
     scene = reconstruct_with(model, mixed)
     assert scene.mask is not None
     assert ((scene.mask - PADDED).abs() < 1e-6).any()
-    assert (without_padding(scene.mask) == 1).all()
+    assert (without_padding(scene.mask) > 0.999).float().mean() > 0.95  # but for the padding's edge
     assert (scene.depth[scene.mask < 0.5] == 0).all()
     scene.save(tmp_path / "out", ["colmap"])
     sizes = {file.name: Image.open(file).size for file in (tmp_path / "out" / "colmap" / "images").iterdir()}

@@ -48,7 +48,7 @@ def test_round_trip(tmp_path: Path, degree: int, name: str) -> None:
     torch.testing.assert_close(after.sh, before.sh, atol=1e-5, rtol=1e-5)
     turned = (F.normalize(after.quats, dim=-1) * F.normalize(before.quats, dim=-1)).sum(-1).abs()
     torch.testing.assert_close(turned, torch.ones(40), atol=1e-5, rtol=0)
-    torch.testing.assert_close(colors(after), colors(before), atol=2e-4, rtol=0)
+    torch.testing.assert_close(colors(after), colors(before), atol=2e-3, rtol=0)
 
 
 def test_layout_of_the_extension(tmp_path: Path) -> None:

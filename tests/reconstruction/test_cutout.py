@@ -42,7 +42,7 @@ def scene(target: list[float], cameras: Cameras) -> Scene:
     gaussians = Gaussians(
         means,
         torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
-        torch.full((count, 3), 0.04),
+        torch.where(means.sub(torch.tensor(target)).norm(dim=1) > 7, 0.15, 0.04)[:, None].repeat(1, 3),
         torch.full((count,), 0.95),
         torch.zeros(count, 1, 3),
         torch.zeros(count, dtype=torch.int64),

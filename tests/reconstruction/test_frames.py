@@ -17,6 +17,7 @@ from vg2gt import io
 from vg2gt.cli import place
 from vg2gt.geometry.cameras import project
 from vg2gt.inputs.given_cameras import given_pictures
+from vg2gt.io.cameras_json import invert_pose
 from vg2gt.outputs.saved import read_scene
 from vg2gt.reconstruction.frame import upright_rotation
 from vg2gt.reconstruction.pipeline import reconstruct_with
@@ -70,7 +71,7 @@ def test_gps_gives_metres_and_up(folder: Path, frames, tmp_path: Path, monkeypat
     """Cameras of an aeroplane look down: what they have below them is not gravity."""
     put_colmap(folder, frames)
     monkeypatch.setattr("vg2gt.inputs.camera_source.SFM_SOURCE", "COLMAP")
-    centers = io.invert_pose(frames.world_to_camera.double().numpy())[:, :3, 3]
+    centers = invert_pose(frames.world_to_camera.double().numpy())[:, :3, 3]
     to_enu = 37 * Rotation.from_euler("x", 180, degrees=True).as_matrix()  # the room's z is down
     for file, position in zip(sorted((folder / "images").iterdir()), on_earth(centers @ to_enu.T), strict=True):
         with_gps(file, position)
@@ -84,7 +85,7 @@ def test_gps_gives_metres_and_up(folder: Path, frames, tmp_path: Path, monkeypat
     np.testing.assert_allclose(scene.frame.world_place.to_enu, report["gps"]["to_enu"], atol=1e-6)
     np.testing.assert_allclose(report["gps"]["up"], [0, -1, 0], atol=1e-6)
     assert report["gps"]["origin"][0] == pytest.approx(46.84, abs=0.01)
-    found = io.invert_pose(scene.poses.numpy())[:, :3, 3] @ np.array(report["gps"]["to_enu"])[:3, :3].T
+    found = invert_pose(scene.poses.numpy())[:, :3, 3] @ np.array(report["gps"]["to_enu"])[:3, :3].T
     known = centers @ to_enu.T
     np.testing.assert_allclose(found - found[0], known - known[0], atol=0.02 * np.ptp(known))
 
@@ -153,7 +154,7 @@ def test_two_points_or_control_points_place_a_scene(folder: Path, frames, tmp_pa
         with pytest.raises(SystemExit):
             place.main([str(out), f"--scale={wrong}"])
     points = np.array([[0, 0, 0], [4, 0, 0], [0, 0, 5], [4, 1, 5.0]])
-    to_enu = 11 * Rotation.from_euler("x", 90, degrees=True).as_matrix()
+    to_enu = 11 * Rotation.from_euler("x", -90, degrees=True).as_matrix()
     np.savetxt(tmp_path / "control.csv", np.hstack([points, on_earth(points @ to_enu.T)]), delimiter=",", fmt="%.12f")
     place.main([str(out), "--control", str(tmp_path / "control.csv")])
     scene = read_scene(out, Renderer())

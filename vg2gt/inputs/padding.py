@@ -15,7 +15,7 @@ from vg2gt.inputs.pictures import Picture
 
 PADDED = 1e-3
 """Mask of padding: hardly any weight, but unlike 0 it does not say that nothing is there (:func:`without_padding`)."""
-LEAST_KEPT = 0.75  # share of a picture's area; one that would lose more to cropping is padded
+LEAST_KEPT = 0.8  # share of a picture's area; one that would lose more to cropping is padded
 
 
 def padded(picture: Picture, shape: tuple[int, int]) -> Picture:
