@@ -73,7 +73,7 @@ def write_gaussian_gltf(
         extension["extensions"] = {used[1]: {"bufferView": 0}}
     starts = np.cumsum([0, *(len(part) for part in parts)]).tolist()
     target = {} if compressed else {"target": 34962}
-    content = {
+    content: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "vg2gt"},
         "extensionsUsed": used,
         **({"extensionsRequired": used} if compressed else {}),
@@ -182,7 +182,8 @@ def _parsed(path: Path) -> tuple[dict[str, Any], list[bytes]]:
     """Returns the JSON of a file, and its buffers."""
     data, embedded = regular(path).read_bytes(), None
     if data[:4] == struct.pack("<I", _MAGIC):
-        start, chunks = 12, {}
+        start = 12
+        chunks: dict[int, bytes] = {}
         while start + 8 <= len(data):
             length, kind = struct.unpack_from("<II", data, start)
             chunks.setdefault(kind, data[start + 8 : start + 8 + length])

@@ -88,12 +88,12 @@ def gps_position(path: Path) -> tuple[float, float, float] | None:
     try:
         with open_image(path) as image:
             gps = image.getexif().get_ifd(ExifTags.IFD.GPSInfo)
-        degrees = [
+        latitude, longitude = (
             sum(float(part) / 60**power for power, part in enumerate(gps[angle])) * (-1 if gps[side] in "SW" else 1)
             for angle, side in ((tags.GPSLatitude, tags.GPSLatitudeRef), (tags.GPSLongitude, tags.GPSLongitudeRef))
-        ]
+        )
         is_below = gps.get(tags.GPSAltitudeRef, b"\0") in (b"\1", 1, 3)
-        found = (*degrees, float(gps[tags.GPSAltitude]) * (-1 if is_below else 1))
+        found = (latitude, longitude, float(gps[tags.GPSAltitude]) * (-1 if is_below else 1))
     except Exception:  # damaged EXIF data raise various errors
         return None
     is_sound = abs(found[0]) <= 90 and abs(found[1]) <= 180 and all(map(math.isfinite, found))

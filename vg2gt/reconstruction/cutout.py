@@ -58,7 +58,7 @@ def cut_to_object(scene: Scene) -> Scene:
 
     def belongs(points: Tensor) -> Tensor:
         place = _cells(points, low, step)
-        known = np.all((place >= 0) & (place < grid.shape), axis=1)
+        known = np.all((place >= 0) & (place < np.array(grid.shape)), axis=1)
         return torch.from_numpy(known & kept_cells[tuple(np.where(known[:, None], place, 0).T)])
 
     depth = scene.depth.clone()
