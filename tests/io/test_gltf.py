@@ -102,7 +102,8 @@ def test_compressed_files_hold_spz_of_version_2(tmp_path: Path) -> None:
     after = read_gaussians(path)
     torch.testing.assert_close(after.means, before.means, rtol=0, atol=2e-6)
     turned = (F.normalize(after.quats, dim=-1) * F.normalize(before.quats, dim=-1)).sum(-1).abs()
-    assert turned.min() > 0.999
+    assert turned.min() > 0.99  # a byte for each of x y z: w follows from them, coarsely where it is small
+    assert turned.mean() > 0.999
     assert (colors(after) - colors(before)).abs().mean() < 0.01
     assert path.stat().st_size < write_gaussian_gltf(tmp_path / "b.glb", before).stat().st_size / 5
 

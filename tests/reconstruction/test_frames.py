@@ -163,6 +163,5 @@ def test_two_points_or_control_points_place_a_scene(folder: Path, frames, tmp_pa
     assert scene.frame.world_place is not None
     np.testing.assert_allclose(scene.frame.world_place.up, [0, -1, 0], atol=1e-3)
     (tmp_path / "control.csv").write_text("1,2,3,4,5,6\n")
-    with pytest.raises(SystemExit):
+    with pytest.raises(SystemExit, match="three or more"):
         place.main([str(out), "--control", str(tmp_path / "control.csv")])
-    assert "three or more" in capsys.readouterr().err

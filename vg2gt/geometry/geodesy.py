@@ -15,6 +15,7 @@ _EQUATOR, _FLATTENING = 6378137.0, 1 / 298.257223563  # WGS 84, radius in metres
 _FEWEST = 4  # positions
 _DRAWS = 300
 _WITHIN = 3.0  # median distances up to which a position counts
+_SURE = 0.05  # metres within which it always does
 _COARSE = 0.05  # largest relative error of the scale
 _LINE = 1e-3  # width of the positions, relative to their length, up to which they are on a line
 _TILT = 0.05  # largest standard error of the turn about that line, in radians
@@ -91,11 +92,11 @@ def fit_place(centers: NDArray[np.float64], positions: NDArray[np.float64]) -> P
     candidates = align_points(source[draws], target[draws])
     distances = (candidates.apply(source.expand(_DRAWS, -1, -1)) - target).norm(dim=-1)
     distance = distances[distances.median(1).values.nan_to_num(torch.inf).argmin()]
-    near = distance <= _WITHIN * distance.median()
+    near = distance <= (_WITHIN * distance.median()).clamp(min=_SURE)
     for _ in range(3):
         fit = align_points(source[None, near], target[None, near])
         distance = (fit.apply(source[None]) - target).norm(dim=-1)[0]
-        near = distance <= _WITHIN * distance.median()
+        near = distance <= (_WITHIN * distance.median()).clamp(min=_SURE)
     place = place_of_points(source[near].numpy(), positions[known][near.numpy()])
     return place if place.scale_error <= _COARSE else None
 
