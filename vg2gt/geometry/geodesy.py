@@ -14,6 +14,7 @@ from vg2gt.geometry.alignment import align_points
 _EQUATOR, _FLATTENING = 6378137.0, 1 / 298.257223563  # WGS 84, radius in metres
 _FEWEST = 4  # positions
 _DRAWS = 300
+_AGREE = 0.8  # share of the positions that a candidate must fit
 _WITHIN = 3.0  # median distances up to which a position counts
 _SURE = 0.05  # metres within which it always does
 _COARSE = 0.05  # largest relative error of the scale
@@ -71,8 +72,8 @@ def enu(positions: NDArray[np.float64], origin: NDArray[np.float64]) -> NDArray[
 def fit_place(centers: NDArray[np.float64], positions: NDArray[np.float64]) -> Place | None:
     """Fits a similarity from camera centres to measured positions; outliers do not count.
 
-    Candidates are the similarities of three cameras each; the one with the least median distance is fitted again to all
-    positions within three times that distance.
+    Candidates are the similarities of three cameras each; the one that fits four fifths of the positions best is fitted
+    again to all positions within three times the median distance.
 
     Args:
         centers: ``[N, 3]`` in the cameras' world.
@@ -91,7 +92,7 @@ def fit_place(centers: NDArray[np.float64], positions: NDArray[np.float64]) -> P
     draws = torch.stack([torch.randperm(len(source), generator=generator)[:3] for _ in range(_DRAWS)])
     candidates = align_points(source[draws], target[draws])
     distances = (candidates.apply(source.expand(_DRAWS, -1, -1)) - target).norm(dim=-1)
-    distance = distances[distances.median(1).values.nan_to_num(torch.inf).argmin()]
+    distance = distances[distances.quantile(_AGREE, 1, interpolation="higher").nan_to_num(torch.inf).argmin()]
     near = distance <= (_WITHIN * distance.median()).clamp(min=_SURE)
     for _ in range(3):
         fit = align_points(source[None, near], target[None, near])

@@ -52,7 +52,7 @@ def write_gaussian_gltf(
     Args:
         path: a file ending in ``.glb`` (binary) or ``.gltf`` (JSON that contains the values).
         gaussians: the scene.
-        compressed: write an SPZ of version 2 inside, about a fourteenth of the size; :mod:`vg2gt.io.spz` lists losses.
+        compressed: write an SPZ of version 2 inside, about a quarter of the size; :mod:`vg2gt.io.spz` lists losses.
         antialiased: as for :func:`vg2gt.io.write_spz`; only compressed files can say so.
 
     Raises:
@@ -126,8 +126,8 @@ def read_gaussian_gltf(path: str | Path) -> Gaussians:
             for primitive in content["meshes"][node["mesh"]]["primitives"]
             if _NAME in primitive.get("extensions", {})
         ]
-    except FormatError:
-        raise
+    except FormatError as error:
+        raise error if str(path) in str(error) else FormatError(f"{path}: {error}") from error
     except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError, struct.error) as error:
         raise FormatError(f"{path}: not a glTF file, or damaged ({type(error).__name__}: {error})") from error
     if not found:
