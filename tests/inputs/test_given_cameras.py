@@ -1,5 +1,6 @@
 """Camera files next to the images: their order of preference, and which images they belong to."""
 
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -207,3 +208,28 @@ def test_a_phones_export_is_read_at_the_size_of_its_photographs(needed: bool, tm
     loaded = pictures[1].read((30, 40))
     assert bool(loaded.depth.any()) == needed
     torch.testing.assert_close(loaded.world_to_camera[0], frames.world_to_camera[1], atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("put", [put_transforms, put_cameras])
+def test_paths_from_windows(put, folder: Path, frames) -> None:
+    """Backslashes; those of masks and depth were not found, only those of images."""
+    put(folder, frames)
+    file = folder / ("transforms.json" if put is put_transforms else "cameras.json")
+    content = json.loads(file.read_text())
+    if put is put_transforms:
+        (folder / "masks" / "left").mkdir(parents=True)
+        half = np.where(np.arange(112) < 56, 0, 255).astype(np.uint8) * np.ones((84, 1), np.uint8)
+        for entry in content["frames"]:
+            name = Path(entry["file_path"]).name
+            Image.fromarray(half).save(folder / "masks" / "left" / name)
+            entry.update(file_path=f".\\images\\{name}", mask_path=f"masks\\left\\{name}")
+    else:
+        for entry in content:
+            entry["name"] = f"images\\{entry['name']}"
+    file.write_text(json.dumps(content))
+    pictures = given_pictures(folder) or []
+    assert [picture.name for picture in pictures] == [Path(name).stem for name in NAMES]
+    if put is put_transforms:
+        mask = pictures[0].read(SIZE).mask
+        assert mask is not None
+        assert torch.equal(mask[0, 0], (torch.arange(112) >= 56).float())

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scipy import ndimage
 
 from vg2gt.inputs import pictures
 from vg2gt.inputs.inputs import load_views, working_size
@@ -41,10 +42,35 @@ def test_frames_of_a_video(tmp_path: Path) -> None:
     path = write_video(tmp_path / "clip.gif", frames)
     assert len(find_pictures(path)) == 32
     chosen = find_pictures(path, max_images=3)
-    assert [p.name for p in chosen] == ["clip-000000", "clip-000034", "clip-000069"]
-    assert chosen[2].read((14, 14)).images.mean().item() == pytest.approx(69 / 70, abs=0.02)
+    numbers = [int(p.name.removeprefix("clip-")) for p in chosen]
+    assert [number * 3 // 70 for number in numbers] == [0, 1, 2]  # one of each third
+    assert chosen[2].read((14, 14)).images.mean().item() == pytest.approx(numbers[2] / 70, abs=0.02)
     mixed = find_pictures([frames[0], path, frames[1]], max_images=3)
-    assert [p.name for p in mixed] == ["image-000", "clip-000034", "image-001"]
+    assert [p.name for p in mixed] == ["image-000", chosen[1].name, "image-001"]
+
+
+@pytest.mark.parametrize("kept", [100, 2])
+def test_the_sharpest_frames_of_a_video_are_taken(tmp_path: Path, monkeypatch, kept: int) -> None:
+    pytest.importorskip("av")
+    texture = np.random.default_rng(0).integers(0, 256, (96, 160, 3)).astype(np.float32)
+    texture = ndimage.uniform_filter(texture, (3, 3, 0))
+    sharp = {3, 4, 13, 21, 34}
+    frames = []
+    for number in range(36):
+        moved = np.roll(texture, 4 * number, 1)
+        smeared = ndimage.uniform_filter(moved, (0, 9, 0))  # the camera pans: rows stay as sharp as they are
+        frames.append((moved if number in sharp else smeared).clip(0, 255).astype(np.uint8))
+    path = write_video(tmp_path / "pan.mp4", frames)
+    monkeypatch.setattr(pictures, "IN_MEMORY", kept)
+    found = find_pictures(path, max_images=4)
+    assert [p.name for p in found][1:] == ["pan-000013", "pan-000021", "pan-000034"]
+    assert found[0].name in ("pan-000003", "pan-000004")
+    for picture in found:
+        number = int(picture.name.removeprefix("pan-"))
+        shown = picture.read((96, 160)).images[0].permute(1, 2, 0).numpy() * 255
+        assert np.abs(shown - frames[number]).mean() < 12
+    monkeypatch.setattr(pictures, "MOST_FRAMES", 3)
+    assert len(find_pictures(path, max_images=30)) == 3
 
 
 def test_a_reduced_photograph_fits_its_camera() -> None:

@@ -16,6 +16,8 @@ from vg2gt.io.colmap import FILES
 CASES: dict[str, tuple[Callable[[Path], object], Callable[[Path], object]]] = {
     "scene.ply": (lambda path: io.write_gaussian_ply(path, scene(12, 1)), io.read_gaussian_ply),
     "scene.spz": (lambda path: io.write_spz(path, scene(12, 1)), io.read_spz),
+    "scene.glb": (lambda path: io.write_gaussian_gltf(path, scene(12, 1)), io.read_gaussian_gltf),
+    "scene.gltf": (lambda path: io.write_gaussian_gltf(path, scene(12, 1), compressed=True), io.read_gaussian_gltf),
     "transforms.json": (lambda path: io.write_transforms(path, random_transforms(False, 3)), io.read_transforms),
     "cameras.json": (lambda path: io.write_cameras_json(path, mixed()), io.read_cameras_json),
     **{

@@ -102,7 +102,7 @@ def test_version_2_is_read_far_positions_are_kept_and_other_files_are_named(tmp_
 
 def test_suffixes_decide(tmp_path: Path) -> None:
     assert len(read_gaussians(write_gaussian_ply(tmp_path / "a.PLY", scene(2)))) == 2
-    with pytest.raises(ValueError, match=r"expected a scene of Gaussians, \.ply or \.spz"):
+    with pytest.raises(ValueError, match=r"expected a scene of Gaussians, \.ply, \.spz, \.glb, \.gltf"):
         read_gaussians(tmp_path / "a.splat")
     with pytest.raises(FileNotFoundError, match=r"a\.spz"):
         read_gaussians(tmp_path / "a.spz")

@@ -216,7 +216,7 @@ def test_mistakes_of_a_video(folder: Path) -> None:
     (folder / "nerfstudio.json").write_text(json.dumps({"camera_path": [frame(5)]}))
     (folder / "one.json").write_text(json.dumps([camera(place(0)).fields()]))
     cases: list[tuple[tuple[Path | str, ...], str]] = [
-        ((alone,), r"alone has no scene.ply or scene.spz"),
+        ((alone,), r"alone has no scene.ply"),
         ((alone / "ball.ply",), "alone has no cameras.json: choose the cameras with --cameras, --orbit or --path"),
         ((folder, "--seconds", "3"), "--seconds requires --orbit or --path"),
         ((folder, "--orbit", "--interpolate", "2"), "--interpolate is for views as they are"),

@@ -10,11 +10,14 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from tests.geometry.test_geodesy import on_earth, with_gps
 from tests.inputs.test_given_cameras import put_cameras, put_colmap
 from tests.reconstruction.conftest import SIZE, run
 from vg2gt import io
+from vg2gt.cli import place
 from vg2gt.geometry.cameras import project
 from vg2gt.inputs.given_cameras import given_pictures
+from vg2gt.io.cameras_json import invert_pose
 from vg2gt.outputs.saved import read_scene
 from vg2gt.reconstruction.frame import upright_rotation
 from vg2gt.reconstruction.pipeline import reconstruct_with
@@ -62,6 +65,29 @@ def test_metric_cameras_give_metres(recording: Path, ready, monkeypatch) -> None
     upright = reconstruct_with(ready.model, recording)
     assert upright.metres_per_unit == pytest.approx(upright.frame.scale)
     assert upright.metres_per_unit != pytest.approx(1, abs=0.01)
+
+
+def test_gps_gives_metres_and_up(folder: Path, frames, tmp_path: Path, monkeypatch, capsys) -> None:
+    """Cameras of an aeroplane look down: what they have below them is not gravity."""
+    put_colmap(folder, frames)
+    monkeypatch.setattr("vg2gt.inputs.camera_source.SFM_SOURCE", "COLMAP")
+    centers = invert_pose(frames.world_to_camera.double().numpy())[:, :3, 3]
+    to_enu = 37 * Rotation.from_euler("x", 180, degrees=True).as_matrix()  # the room's z is down
+    for file, position in zip(sorted((folder / "images").iterdir()), on_earth(centers @ to_enu.T), strict=True):
+        with_gps(file, position)
+    run(folder, "--out", tmp_path / "out", "--save", "scene.ply,cameras.json,report.json,views.npz")
+    assert "GPS of 4 photographs" in capsys.readouterr().out
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    scene = read_scene(tmp_path / "out", Renderer())
+    assert scene.frame is not None
+    assert scene.frame.world_place is not None
+    assert scene.metres_per_unit == pytest.approx(37 * scene.frame.scale, rel=0.01)
+    np.testing.assert_allclose(scene.frame.world_place.to_enu, report["gps"]["to_enu"], atol=1e-6)
+    np.testing.assert_allclose(report["gps"]["up"], [0, -1, 0], atol=1e-6)
+    assert report["gps"]["origin"][0] == pytest.approx(46.84, abs=0.01)
+    found = invert_pose(scene.poses.numpy())[:, :3, 3] @ np.array(report["gps"]["to_enu"])[:3, :3].T
+    known = centers @ to_enu.T
+    np.testing.assert_allclose(found - found[0], known - known[0], atol=0.02 * np.ptp(known))
 
 
 def test_map_coordinates_keep_their_digits(folder: Path, frames, model, caplog) -> None:
@@ -114,3 +140,28 @@ def test_own_cameras_serve_the_original_photographs(folder: Path, frames, tmp_pa
     assert loaded.images.shape[-2:] == SIZE
     assert torch.allclose(loaded.intrinsics[0], frames.intrinsics[2], atol=1e-3)
     assert torch.allclose(loaded.world_to_camera[0], frames.world_to_camera[2], atol=1e-6)
+
+
+def test_two_points_or_control_points_place_a_scene(folder: Path, frames, tmp_path: Path, capsys) -> None:
+    put_colmap(folder, frames)
+    out = tmp_path / "out"
+    run(folder, "--out", out, "--save", "cameras.json,scene.ply,report.json,views.npz")
+    place.main([str(out), "--scale", "0,0,1,0.3,0.4,1=120cm"])
+    assert "is 2.4 m" in capsys.readouterr().out
+    assert read_scene(out, Renderer()).metres_per_unit == pytest.approx(2.4)
+    assert json.loads((out / "report.json").read_text())["metres_per_unit"] == pytest.approx(2.4)
+    for wrong in ("0,0,1=1m", "0,0,1,0,0,1=1m", "0,0,1,0,0,2=1", "0,0,1,0,0,2=-1m", "0,0,1,0,0,nan=1m"):
+        with pytest.raises(SystemExit):
+            place.main([str(out), f"--scale={wrong}"])
+    points = np.array([[0, 0, 0], [4, 0, 0], [0, 0, 5], [4, 1, 5.0]])
+    to_enu = 11 * Rotation.from_euler("x", -90, degrees=True).as_matrix()
+    np.savetxt(tmp_path / "control.csv", np.hstack([points, on_earth(points @ to_enu.T)]), delimiter=",", fmt="%.12f")
+    place.main([str(out), "--control", str(tmp_path / "control.csv")])
+    scene = read_scene(out, Renderer())
+    assert scene.metres_per_unit == pytest.approx(11, rel=1e-3)
+    assert scene.frame is not None
+    assert scene.frame.world_place is not None
+    np.testing.assert_allclose(scene.frame.world_place.up, [0, -1, 0], atol=1e-3)
+    (tmp_path / "control.csv").write_text("1,2,3,4,5,6\n")
+    with pytest.raises(SystemExit, match="three or more"):
+        place.main([str(out), "--control", str(tmp_path / "control.csv")])

@@ -179,6 +179,7 @@ PIPES: dict[str, Callable[[Path], object]] = {
     "depth.npz": lambda path: load_npz(path, "room", ["depth"]),
     "scene.ply": formats.read_gaussian_ply,
     "scene.spz": formats.read_spz,
+    "scene.glb": formats.read_gaussian_gltf,
     "clip.mp4": lambda path: list(formats.read_video(path)),
     "clip.gif": lambda path: list(formats.read_video(path)),
     "cameras.json": formats.read_cameras_json,

@@ -5,6 +5,7 @@ import shutil
 import subprocess
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -104,3 +105,28 @@ def test_dragging_turns_around_what_the_middle_shows() -> None:
         assert abs(x) < 0.1
         assert abs(y) < 0.1
         assert depth == pytest.approx(4, abs=0.3)
+
+
+def test_measuring_cropping_and_views_to_keep() -> None:
+    """What is measured is what vg2gt place takes; a kept view is a camera of ours; a crop leaves the rest away."""
+    record = ball_before_a_wall().initial().fields()
+    answer = run(f"""
+        const view = new View([0, -1, 0]);
+        view.set(fromRecord({json.dumps(record)}));
+        const back = toRecord("view-0", view), means = new Float32Array([0, 0, 1, 0, 0, 2, 3, 0, 3, 0, 0, 4]);
+        const order = (box) => [...makeDepthSorter(means)([0, 0, 1, 0], 0.1, box)];
+        view.level([1, 0, 0]);
+        answer = {{
+          text: measured([[0, 0, 1], [0.3, 0.4, 1]], null), metres: measured([[0, 0, 1], [0.3, 0.4, 1]], 2.4),
+          whole: cropBox([0, 200, 0, 200, 0, 200], [[0, 1], [0, 1], [0, 1]]),
+          half: cropBox([0, 100, 0, 200, 50, 200], [[0, 1], [0, 1], [0, 8]]).map((v) => Number.isFinite(v) ? v : null),
+          orders: [order(null), order([-1, -1, 1.5, 1, 1, 9])], back, axes: view.axes,
+        }};""")
+    assert answer["text"] == "0.5 scene units. To set the scale: vg2gt place DIR --scale=0,0,1,0.3,0.4,1=LENGTHm"
+    assert answer["metres"].startswith("1.2 m.")
+    assert answer["whole"] is None
+    assert answer["half"] == [None, None, 2, 0.5, None, None]
+    assert answer["orders"] == [[3, 2, 1, 0], [3, 1]]
+    for field in ("width", "height", "intrinsics", "world_to_camera"):
+        assert np.allclose(answer["back"][field], record[field])
+    assert np.allclose(answer["axes"][1], [-1, 0, 0])  # down; the camera looks along z

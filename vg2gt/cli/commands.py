@@ -46,6 +46,10 @@ COMMANDS = {
         "writes a scene as one page for the browser",
         "vg2gt view scene.ply --cameras cameras.json --open",
     ),
+    "place": Command(
+        "says how large a scene is, or where it is on the Earth",
+        "vg2gt place outputs/photos --scale 0,0,1,0.5,0,1=1.2m",
+    ),
     "export": Command(
         "writes a frozen network as an ONNX bundle", "vg2gt export backend=da3_small --out bundles/da3_small"
     ),

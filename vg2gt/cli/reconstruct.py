@@ -70,6 +70,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     add("--drop", type=list_of_names, default=[], metavar="LIST", help="drop Gaussians by status, a list of: guessed, "
         "contradicted, single (seen by one view), unseen")  # fmt: skip
     add("--watch", action="store_true", help=WATCH)
+    add("--object", action="store_true", help="keep only the object that the cameras look at, without surroundings")
     add_common_flags(arguments, DEFAULT)
     given, overrides = separate(argv)
     options = arguments.parse_args(given)
@@ -84,6 +85,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     from vg2gt.memory import RECONSTRUCTION, memory_advice
     from vg2gt.monitor import Monitor
     from vg2gt.outputs.outputs import cost_figures, write_outputs
+    from vg2gt.reconstruction.frame import place_lines
     from vg2gt.reconstruction.refined import refinement_lines
     from vg2gt.reconstruction.trust import trust_lines, trusted
     from vg2gt.reconstruction.windows.store import remove, tidy
@@ -104,6 +106,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
             ready = load(options.ckpt, overrides=overrides, device=options.device)
         scene = _scene(options, ready, how_to_refine, monitor)
         scene = trusted(scene, options.min_confidence, options.drop)
+        scene = scene.cut_to_object() if options.object else scene
         if len(scene.gaussians) > LARGE and TILES not in options.save:
             options.save.append(TILES)
         trained = bool(ready.model.trained_parameters())
@@ -132,7 +135,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     print(f"{len(scene.names)} images of {height}x{width}: {len(scene.gaussians)} Gaussians")
     if scene.refined is not None:
         print(*refinement_lines(scene), sep="\n")
-    print(*trust_lines(scene), sep="\n")
+    print(*trust_lines(scene), *place_lines(scene), sep="\n")
     print(f"weights: {figures['weights']}; cameras: {scene.cameras_from or PREDICTED}")
     print(f"seconds: {times}; peak memory {cost['peak_memory_mib']} MiB")
     print(f"written: {', '.join(str(folder / name) for name in options.save)}")

@@ -36,7 +36,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Runs the command; errors are reported in one line."""
     arguments = flag_parser("render", listing(OUTPUTS))
     add = arguments.add_argument
-    add("scene", help="a scene's folder, scene.ply or .spz")
+    add("scene", help="a scene's folder, scene.ply, .spz, .glb or .gltf")
     motion = arguments.add_mutually_exclusive_group().add_argument
     motion("--cameras", metavar="PATH", help="cameras.json, transforms.json, or a COLMAP model's folder; default: the "
         "cameras.json next to the scene")  # fmt: skip

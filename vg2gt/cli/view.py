@@ -26,7 +26,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Writes the page; wrong arguments or files are reported in one line."""
     parser = flag_parser("view")
     add = parser.add_argument
-    add("scene", type=Path, help="a scene's folder, scene.ply or .spz")
+    add("scene", type=Path, help="a scene's folder, scene.ply, .spz, .glb or .gltf")
     add("--cameras", type=Path, help="cameras, the first is the initial view; default: cameras.json next to the scene")
     add("--images", type=Path, help="folder of the cameras' images; default: that of cameras.json, or views.npz in it")
     add("--color", choices=("trust",), help="trust: colour by stated error and status of a scene.ply written by vg2gt")

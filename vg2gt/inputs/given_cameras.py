@@ -38,7 +38,7 @@ from vg2gt.inputs.pictures import (
 from vg2gt.io.cameras_json import NamedCamera, Photo, read_cameras_json
 from vg2gt.io.errors import FormatError, some
 from vg2gt.io.files import read_json
-from vg2gt.io.image_files import read_color
+from vg2gt.io.image_files import is_damaged, read_color
 from vg2gt.io.nerfstudio import read_transforms
 from vg2gt.io.photogrammetry import is_camera_file
 from vg2gt.io.record3d import R3D
@@ -245,7 +245,7 @@ def _name_missing(pictures: list[Picture], folder: Path, others: set[Path]) -> N
     except (ValueError, OSError):  # the pictures are elsewhere, such as in an archive
         return
     if any(file.resolve() in known for file in files):
-        missing = [file for file in files if file.resolve() not in known | others]
+        missing = [file for file in files if file.resolve() not in known | others and not is_damaged(file)]
         _name_left_out([str(file.relative_to(folder)) for file in missing], pictures[0].source)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,11 +21,8 @@ from vg2gt.io.cameras_json import NamedCamera, Photo
 from vg2gt.monitor import Monitor
 from vg2gt.types import Cameras, Geometry, Hints
 
-log = logging.getLogger(__name__)
-
 LONGER_SIDE = {"cuda": 518, "cpu": 280}  # pixels, by device; foundation models are trained at about 518
 _THUMBNAIL = 24  # pixels per side
-_LEAST_KEPT = 0.75  # share of a picture's area; cropping more is warned about
 _FEWEST_POINTS = 20  # minimum observations of sparse points for a depth range
 _OUTLIERS, _NEARER, _FARTHER = 1, 0.8, 1.4  # percent cut at either end, widening factors
 
@@ -90,14 +86,6 @@ def load_views(pictures: Sequence[Picture], size: tuple[int, int], monitor: Moni
         for picture in pictures:
             frames.append(resize_to_cover(picture.read(size), size))
             advance()
-    ratios = [(p.size[0] / p.size[1]) / (size[0] / size[1]) for p in pictures]
-    much = [p.name for p, ratio in zip(pictures, ratios, strict=True) if min(ratio, 1 / ratio) < _LEAST_KEPT]
-    if much:
-        log.warning(
-            "%d of %d images have a different aspect ratio than %dx%d and lose more than a quarter to cropping (first: "
-            "%s); reconstruct images of one shape together, or choose another size",
-            len(much), len(pictures), size[0], size[1], much[0],
-        )  # fmt: skip
     joined = Frames.concatenate(frames)
     mask = None if joined.mask is None else joined.mask[None]
     source, hints = source_of(pictures), Hints(frame_ids=torch.arange(len(pictures))[None], mask=mask)
@@ -112,7 +100,9 @@ def photo_of(camera: NamedCamera, picture: Picture) -> Photo:
     """Returns the camera of a view's whole photograph from the view's camera (inverse of ``resize_to_cover``)."""
     name = camera.name if picture.path is None else picture.path.name
     matrix = photo_intrinsics(torch.from_numpy(camera.intrinsics), (camera.height, camera.width), picture.size)
-    return Photo(name, picture.size[1], picture.size[0], matrix.numpy(), picture.lens)
+    (height, width), (rows, columns) = (picture.whole or picture).size, picture.size
+    matrix = crop_intrinsics(matrix, (columns - width) // 2, (rows - height) // 2)
+    return Photo(name, width, height, matrix.numpy(), picture.lens)
 
 
 def photo_intrinsics(intrinsics: Tensor, size: tuple[int, int], photo: tuple[int, int]) -> Tensor:

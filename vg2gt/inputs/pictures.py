@@ -31,7 +31,7 @@ from vg2gt.io.image_files import focal_length, image_size, is_damaged, read_colo
 from vg2gt.io.images import color_image, has_alpha
 from vg2gt.io.photogrammetry import is_camera_file
 from vg2gt.io.record3d import R3D, is_archive, read_recorded, recorded_files
-from vg2gt.io.video import VIDEO_SUFFIXES, VideoFrames, count_frames, read_video, require_pyav, video_size
+from vg2gt.io.video import VIDEO_SUFFIXES, VideoFrames, count_frames, require_pyav, sharpest_frames, video_size
 
 log = logging.getLogger(__name__)
 
@@ -41,6 +41,7 @@ T = TypeVar("T")
 
 _HOLDS_PICTURES = (*PHOTO_SUFFIXES, R3D)
 VIDEO_FRAMES = 32  # frames taken from a video by default
+MOST_FRAMES = 1000  # frames taken from a video at most
 IN_MEMORY = 100  # maximum number of video frames kept in memory; with more, each is decoded on demand
 SFM_SOURCE = "structure from motion"  # prefix of the source of cameras found by it
 UNKNOWN_LENS = "unknown"  # lens of images that structure from motion has undistorted
@@ -66,6 +67,7 @@ class Picture:
         container: the video or panorama that it is a part of; None: none.
         is_metric: whether its camera (and depth) is in metres.
         lens: lens that its file was undistorted from (``undistortion.lens_text``); empty for a pinhole image.
+        whole: the picture without the padding of this one; None: it is not padded.
     """
 
     name: str
@@ -82,6 +84,7 @@ class Picture:
     container: Path | None = None
     is_metric: bool = False
     lens: str = ""
+    whole: Picture | None = None
 
 
 def find_pictures(images: ImagesLike, max_images: int | None = None) -> list[Picture]:
@@ -91,6 +94,7 @@ def find_pictures(images: ImagesLike, max_images: int | None = None) -> list[Pic
         images: a file, folder or video, a Pillow image, an array ``[H, W, 3]`` or ``[V, H, W, 3]`` (uint8), a tensor
             ``[3, H, W]`` or ``[V, 3, H, W]`` in [0, 1], or a sequence of these, in any mixture.
         max_images: maximum number of pictures, evenly spread; None: all, but 32 frames of a video.
+            Videos give the sharpest frame of each interval, at most 1,000.
 
     Returns:
         The pictures in order, with unique names. Files that are no images are left out, named in a warning.
@@ -335,9 +339,13 @@ def _photo(path: Path, content_of: Callable[[Path], bytes | None] = lambda _: No
 
 
 def _video(path: Path, limit: int) -> list[Picture]:
+    """Returns all frames of a video, or the sharpest of each of ``limit`` intervals."""
     count = count_frames(path)
-    numbers = range(count) if count <= limit else spread(count, limit)
-    if len(numbers) > IN_MEMORY:
+    if limit > MOST_FRAMES < count:
+        log.warning("%s: %d frames are taken of %d, the most of a video", path, MOST_FRAMES, count)
+    chosen = sharpest_frames(path, count, min(count, limit, MOST_FRAMES))
+    if min(count, limit) > IN_MEMORY:
+        numbers = [number for number, _ in chosen]
         size, frames = video_size(path), VideoFrames(path, set(numbers))
 
         def picture(number: int) -> Picture:
@@ -346,7 +354,7 @@ def _video(path: Path, limit: int) -> list[Picture]:
 
         found = [picture(number) for number in numbers]
     else:
-        found = [_in_memory(f"{path.stem}-{number:06d}", pixels) for number, pixels in read_video(path, set(numbers))]
+        found = [_in_memory(f"{path.stem}-{number:06d}", pixels()) for number, pixels in chosen]
     return [replace(each, container=path) for each in found]
 
 

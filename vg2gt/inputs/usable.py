@@ -20,6 +20,7 @@ from vg2gt.data.base import DataError, Frames
 from vg2gt.data.sources.masks import joined_masks, resized_mask
 from vg2gt.data.transforms import to_bytes
 from vg2gt.inputs.pictures import IN_MEMORY, Picture, name_left_out, reason_of
+from vg2gt.io.images import curvatures
 from vg2gt.monitor import Monitor
 
 log = logging.getLogger(__name__)
@@ -129,23 +130,10 @@ def _small(picture: Picture) -> NDArray[np.uint8]:
 
 def _look(pixels: NDArray[np.uint8]) -> _Look:
     grey = pixels.mean(2, dtype=np.float32)
-    fine, *coarse = (_curvatures(grey, step) for step in (1, *_COARSE))
+    fine, *coarse = (curvatures(grey, step) for step in (1, *_COARSE))
     detail = float((fine / np.maximum(np.max(coarse, 0), 1e-6)).min())
     black, white = (pixels.max(2) <= _BLACK).mean(), (pixels.min(2) >= _WHITE).mean()
     return _Look(float(black), float(white), float(grey.std()), detail)
-
-
-def _curvatures(grey: NDArray[np.float32], step: int) -> NDArray[np.float64]:
-    """Returns the mean squared second differences, in four directions, of an image reduced by ``step``."""
-    rows, columns = grey.shape[0] // step, grey.shape[1] // step
-    if min(rows, columns) < 3:
-        return np.zeros(4)
-    small = grey[: rows * step, : columns * step].reshape(rows, step, columns, step).mean((1, 3))
-    found = []
-    for y, x in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        before, after = (small[1 + s * y : rows - 1 + s * y, 1 + s * x : columns - 1 + s * x] for s in (-1, 1))
-        found.append(((2 * small[1:-1, 1:-1] - before - after) ** 2).mean(dtype=np.float64))
-    return np.array(found)
 
 
 def _faults(looks: dict[str, _Look]) -> dict[str, str]:

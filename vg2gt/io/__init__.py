@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     )
     from vg2gt.io.errors import FormatError
     from vg2gt.io.gaussian_files import read_gaussians, write_tiles
+    from vg2gt.io.gltf import read_gaussian_gltf, write_gaussian_gltf
     from vg2gt.io.mesh import Mesh, fuse_depth, write_mesh
     from vg2gt.io.nerfstudio import Lens, Transforms, TransformsFrame, read_transforms, write_transforms
     from vg2gt.io.ply import read_gaussian_ply, write_gaussian_ply
@@ -30,6 +31,7 @@ _NAMES = {
     "colmap": "colmap_from_views colmap_images colmap_intrinsics colmap_pose read_colmap write_colmap",
     "errors": "FormatError",
     "gaussian_files": "read_gaussians write_tiles",
+    "gltf": "read_gaussian_gltf write_gaussian_gltf",
     "mesh": "Mesh fuse_depth write_mesh",
     "nerfstudio": "Lens Transforms TransformsFrame read_transforms write_transforms",
     "ply": "read_gaussian_ply write_gaussian_ply",

@@ -147,6 +147,7 @@ def _camera(place: str, entry: Any) -> NamedCamera:
         photo = Photo(title, *_optics(inside), lens)
     similarity = None if entry.get("similarity") is None else _matrix(fields, "similarity", 4)
     metres = fields.number("metres_per_unit", 0, 1e30)
+    name = name.replace("\\", "/")  # from Windows
     return NamedCamera(name, width, height, intrinsics, pose, photo, similarity, metres)
 
 

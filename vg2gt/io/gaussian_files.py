@@ -8,11 +8,17 @@ import torch
 from torch import Tensor
 
 from vg2gt.io.files import write_json
+from vg2gt.io.gltf import read_gaussian_gltf
 from vg2gt.io.ply import read_gaussian_ply
 from vg2gt.io.spz import read_spz, write_spz
 from vg2gt.types import Gaussians
 
-READERS = {".ply": read_gaussian_ply, ".spz": read_spz}
+READERS = {
+    ".ply": read_gaussian_ply,
+    ".spz": read_spz,
+    ".glb": read_gaussian_gltf,
+    ".gltf": read_gaussian_gltf,
+}
 MOST = 500_000  # Gaussians per tile
 
 
@@ -26,7 +32,7 @@ def read_gaussians(path: str | Path) -> Gaussians:
     path = Path(path)
     reader = READERS.get(path.suffix.lower())
     if reader is None:
-        raise ValueError(f"{path}: expected a scene of Gaussians, {' or '.join(READERS)}")
+        raise ValueError(f"{path}: expected a scene of Gaussians, {', '.join(READERS)}")
     return reader(path)
 
 

@@ -78,6 +78,28 @@ def focal_length(path: Path, size: Size) -> float | None:
     return film * math.hypot(*size) / _FILM_DIAGONAL if 4 <= film <= 2000 else None
 
 
+def gps_position(path: Path) -> tuple[float, float, float] | None:
+    """Returns where a photograph was taken, from its EXIF data.
+
+    Returns:
+        Latitude and longitude in degrees (north and east are positive) and altitude in metres; None if any is unknown.
+    """
+    tags = ExifTags.GPS
+    try:
+        with open_image(path) as image:
+            gps = image.getexif().get_ifd(ExifTags.IFD.GPSInfo)
+        latitude, longitude = (
+            sum(float(part) / 60**power for power, part in enumerate(gps[angle])) * (-1 if gps[side] in "SW" else 1)
+            for angle, side in ((tags.GPSLatitude, tags.GPSLatitudeRef), (tags.GPSLongitude, tags.GPSLongitudeRef))
+        )
+        is_below = gps.get(tags.GPSAltitudeRef, b"\0") in (b"\1", 1, 3)
+        found = (latitude, longitude, float(gps[tags.GPSAltitude]) * (-1 if is_below else 1))
+    except Exception:  # damaged EXIF data raise various errors
+        return None
+    is_sound = abs(found[0]) <= 90 and abs(found[1]) <= 180 and all(map(math.isfinite, found))
+    return found if is_sound and any(found[:2]) else None  # 0, 0 stands for no position
+
+
 def typical_size(sizes: Iterable[Size]) -> Size:
     """Returns a common ``(height, width)`` for images of several sizes: the lower median of each."""
     heights, widths = zip(*sizes, strict=True)

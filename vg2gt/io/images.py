@@ -136,3 +136,16 @@ def encode_image(pixels: NDArray[np.generic], kind: str = "PNG", **options: Any)
 def write_png(path: str | Path, image: Tensor) -> Path:
     """Writes an image ``[3, H, W]`` in [0, 1] as an 8-bit PNG, atomically; returns the path."""
     return write_bytes(path, encode_image(to_pixels(image)))
+
+
+def curvatures(grey: NDArray[np.float32], step: int = 1) -> NDArray[np.float64]:
+    """Returns the mean squared second differences, in four directions, ``[4]``, of an image reduced by ``step``."""
+    rows, columns = grey.shape[0] // step, grey.shape[1] // step
+    if min(rows, columns) < 3:
+        return np.zeros(4)
+    small = grey[: rows * step, : columns * step].reshape(rows, step, columns, step).mean((1, 3))
+    found = []
+    for y, x in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        before, after = (small[1 + s * y : rows - 1 + s * y, 1 + s * x : columns - 1 + s * x] for s in (-1, 1))
+        found.append(((2 * small[1:-1, 1:-1] - before - after) ** 2).mean(dtype=np.float64))
+    return np.array(found)

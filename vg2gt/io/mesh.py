@@ -103,7 +103,7 @@ def write_mesh(path: str | Path, mesh: Mesh) -> Path:
     if not len(mesh.faces):
         raise ValueError("the mesh is empty: no valid depth, or voxels larger than the surfaces; check both")
     in_gltf = path.suffix.lower() == ".glb"
-    colors = _linear(mesh.colors) if in_gltf else mesh.colors
+    colors = linear_colors(mesh.colors) if in_gltf else mesh.colors
     body = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colors, process=False)
     if in_gltf:
         body.apply_transform(np.diag([1.0, -1.0, -1.0, 1.0]))  # glTF has y up, our world has y down
@@ -112,7 +112,7 @@ def write_mesh(path: str | Path, mesh: Mesh) -> Path:
     return write_bytes(path, content)
 
 
-def _linear(colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def linear_colors(colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Converts sRGB to linear colours, which glTF's vertices have."""
     share = colors / 255
     return (255 * np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4) + 0.5).astype(np.uint8)

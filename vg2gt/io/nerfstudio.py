@@ -181,7 +181,9 @@ def _read_lens(fields: Fields, shared: Lens) -> Lens:
 
 
 def _read_frame(fields: Fields, shared: Lens) -> TransformsFrame:
-    file_path, depth, mask = (fields.get(f"{kind}_path", str, "a file name") for kind in ("file", "depth_file", "mask"))
+    kinds = ("file", "depth_file", "mask")
+    named = (fields.get(f"{kind}_path", str, "a file name") for kind in kinds)
+    file_path, depth, mask = (None if name is None else name.replace("\\", "/") for name in named)  # from Windows
     if not file_path:
         raise fields.wrong("file_path", "the name of an image file")
     lens = _read_lens(fields, shared)
@@ -193,7 +195,7 @@ def _read_frame(fields: Fields, shared: Lens) -> TransformsFrame:
         pose = np.linalg.inv(pose @ _OPENGL)
     else:
         pose = np.full((4, 4), np.nan)
-    return TransformsFrame(file_path.replace("\\", "/"), pose, lens, depth, mask)  # paths may be from Windows
+    return TransformsFrame(file_path, pose, lens, depth, mask)
 
 
 def _frame_fields(frame: TransformsFrame, with_lens: bool) -> dict[str, Any]:

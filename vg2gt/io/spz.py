@@ -46,7 +46,11 @@ def write_spz(path: str | Path, gaussians: Gaussians, antialiased: bool = False)
     Raises:
         ValueError: if there is more than one scene or a value cannot be written.
     """
-    arrays = to_arrays(gaussians)
+    return write_bytes(path, encode_spz(to_arrays(gaussians), antialiased=antialiased))
+
+
+def encode_spz(arrays: GaussianArrays, version: int = 3, antialiased: bool = False) -> bytes:
+    """Encodes Gaussians as a ``.spz`` of version 2 or 3 (:func:`write_spz`)."""
     extent = float(np.abs(arrays.means).max(initial=1e-6))
     bits = min(_MOST_BITS, int(np.floor(np.log2((2**23 - 1) / extent))))
     if bits < 0:
@@ -59,11 +63,12 @@ def write_spz(path: str | Path, gaussians: Gaussians, antialiased: bool = False)
         _bytes(arrays.opacities * 255),
         _bytes((arrays.sh[:, 0] * _COLOR + 0.5) * 255),
         _bytes((np.log(arrays.scales) + 10) * 16),
-        _packed(np.roll(arrays.quats, -1, 1)),
+        (_packed if version == 3 else _axes)(np.roll(arrays.quats, -1, 1)),
         _bytes(arrays.sh[:, 1:] * 128 + 128),
     )
-    head = _HEADER.pack(_MAGIC, 3, len(fixed), _DEGREES[arrays.sh.shape[1]], bits, _ANTIALIASED * antialiased, 0)
-    return write_bytes(path, gzip.compress(head + b"".join(column.tobytes() for column in columns), mtime=0))
+    degree = _DEGREES[arrays.sh.shape[1]]
+    head = _HEADER.pack(_MAGIC, version, len(fixed), degree, bits, _ANTIALIASED * antialiased, 0)
+    return gzip.compress(head + b"".join(column.tobytes() for column in columns), mtime=0)
 
 
 def read_spz(path: str | Path) -> Gaussians:
@@ -76,7 +81,11 @@ def read_spz(path: str | Path) -> Gaussians:
         FormatError: if the file is damaged or of another version.
     """
     path = Path(path)
-    content = regular(path).read_bytes()
+    return to_gaussians(path, decode_spz(path, regular(path).read_bytes()))
+
+
+def decode_spz(path: Path, content: bytes) -> GaussianArrays:
+    """Decodes the content of a ``.spz`` file, or of a part of the file ``path`` (:func:`read_spz`)."""
     expected = f"{path}: expected a .spz of version 2 or 3 (splat-transform --spz-version 3 converts others)"
     try:
         with gzip.open(io.BytesIO(content)) as file:
@@ -99,18 +108,23 @@ def read_spz(path: str | Path) -> Gaussians:
     sh = np.concatenate(
         ((color[:, None] / 255 - 0.5) / _COLOR, (rest.reshape(count, sides[5] // 3, 3) - 128.0) / 128), 1
     )
-    arrays = GaussianArrays(
+    return GaussianArrays(
         (fixed.view("<i4")[:, :, 0] >> 8) / 2.0**bits,
         np.roll(_unpacked(rotation), 1, 1),
         np.exp(scale / 16.0 - 10),
         alpha[:, 0] / 255,
         sh,
     )
-    return to_gaussians(path, arrays)
 
 
 def _bytes(values: NDArray[np.floating]) -> NDArray[np.uint8]:
     return np.rint(values).clip(0, 255).astype("u1")
+
+
+def _axes(quats: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Encodes quaternions xyzw as the bytes of x y z of the one with w positive, as version 2 does."""
+    unit = quats / np.linalg.norm(quats, axis=1, keepdims=True)
+    return _bytes(np.where(unit[:, 3:] < 0, -unit, unit)[:, :3] * 127.5 + 127.5)
 
 
 def _packed(quats: NDArray[np.floating]) -> NDArray[np.uint32]:

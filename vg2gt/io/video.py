@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 import io
+import itertools
 import math
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -23,6 +24,7 @@ from PIL import Image
 from vg2gt.io.color import coded_to_srgb, needs_conversion
 from vg2gt.io.errors import FormatError
 from vg2gt.io.files import replacing, write_bytes
+from vg2gt.io.images import curvatures
 
 if TYPE_CHECKING:
     from av import VideoCodecContext, VideoFrame  # optional
@@ -35,7 +37,9 @@ _PALETTE = 255
 _UNSPECIFIED, _BT709, _BT601 = 2, 1, 5  # matrices from YUV to RGB as PyAV numbers them
 _LIMITED = 1  # range of values of usual videos: 16 to 235
 _EXACT = 0x4 | 0x2000 | 0x40000  # FFmpeg's scaler: bicubic, chroma for every pixel, accurate rounding
+_SHARPNESS_SIDE = 640  # longer side of the frames that are compared, in pixels
 _STANDARD_LINES = 576  # rows of a video in standard definition, at most
+_UNDECODABLE = "no frame of it can be decoded; it is truncated or damaged"
 # Containers that hold all their frames. FFmpeg detects formats by content: a playlist under any name would make it open
 # other files of this machine.
 _CONTAINERS = "mov,matroska,avi,mpegts,mpeg,flv,asf,ogg,gif"
@@ -72,7 +76,42 @@ def read_video(path: str | Path, numbers: Container[int] | None = None) -> Itera
             if numbers is None or number in numbers:
                 yield number, _upright(frame, container.streams.video[0].codec_context)
         if number < 0:
-            raise FormatError(f"{path}: no frame of it can be decoded; it is truncated or damaged")
+            raise FormatError(f"{path}: {_UNDECODABLE}")
+
+
+def sharpest_frames(path: str | Path, count: int, limit: int) -> Iterator[tuple[int, Callable[[], NDArray[np.uint8]]]]:
+    """Finds the sharpest frame of each of ``limit`` equal intervals of a video; decodes it once, one frame at a time.
+
+    Frames are compared by their finest detail in the direction in which they have least, which motion blurs.
+
+    Args:
+        path: the file.
+        count: number of its frames (:func:`count_frames`).
+        limit: number of intervals, at most ``count``.
+
+    Yields:
+        The frame number, from 0, and a function that returns the pixels ``[H, W, 3]`` before the next one is asked for.
+
+    Raises:
+        FormatError: if no frame can be decoded.
+        ImportError: if PyAV is not installed.
+    """
+    with _opened(path) as container:
+        numbered = enumerate(_decoded(container))
+        found = False
+        for _, frames in itertools.groupby(numbered, lambda pair: min(pair[0] * limit // count, limit - 1)):
+            number, sharpest = max(frames, key=lambda pair: _sharpness(pair[1]))
+            found = True
+            yield number, lambda frame=sharpest: _upright(frame, container.streams.video[0].codec_context)
+        if not found:
+            raise FormatError(f"{path}: {_UNDECODABLE}")
+
+
+def _sharpness(frame: VideoFrame) -> float:
+    scale = min(1.0, _SHARPNESS_SIDE / max(frame.width, frame.height))
+    width, height = (max(1, round(side * scale)) for side in (frame.width, frame.height))
+    grey = frame.reformat(width, height, "gray").to_ndarray()
+    return float(curvatures(grey.astype(np.float32)).min())
 
 
 class VideoFrames:

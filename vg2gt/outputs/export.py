@@ -54,6 +54,7 @@ class ExportedViews:
             path = folder / name
             path.parent.mkdir(parents=True, exist_ok=True)
             if picture is not None:
+                picture = picture.whole or picture
                 file = None if picture.lens else picture.path
                 if file is not None and orientation(file, "") == 1 and image_size(file, "") == picture.size:
                     shutil.copyfile(file, path)

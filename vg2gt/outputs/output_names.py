@@ -12,6 +12,9 @@ MAPS = {
 OUTPUTS = {
     "scene.ply": "the Gaussians, as 3D Gaussian Splatting writes them, with error and support",
     "scene.spz": "the same, about 16 bytes each (Niantic's SPZ, version 3)",
+    "scene.glb": "the same as glTF (KHR_gaussian_splatting), full precision",
+    "scene.gltf": "the same as one JSON file",
+    "scene.spz.glb": "glTF with an SPZ of version 2 inside (KHR_gaussian_splatting_compression_spz_2, a draft)",
     "scene.html": "a page that shows the scene in a browser, as vg2gt view writes it",
     "tiles": "the same split into regions, SPZ files and index.json in tiles/; default above a million Gaussians",
     "cameras.json": "the cameras of the views",

@@ -25,6 +25,7 @@ from vg2gt.io import (
     fuse_depth,
     write_cameras_json,
     write_colmap,
+    write_gaussian_gltf,
     write_gaussian_ply,
     write_mesh,
     write_point_ply,
@@ -38,6 +39,7 @@ from vg2gt.io.video import video_writer
 from vg2gt.monitor import Monitor
 from vg2gt.outputs.export import exported_views
 from vg2gt.outputs.output_names import DEFAULT, MAPS, OUTPUTS, PREDICTED
+from vg2gt.reconstruction.frame import place_figures
 from vg2gt.reconstruction.refined import refinement_figures
 from vg2gt.reconstruction.trust import trust_figures, trust_picture
 from vg2gt.viewer import ViewerScene, scene_title, thumbnail, write_viewer_html
@@ -172,6 +174,7 @@ def scene_figures(scene: Scene) -> dict[str, Any]:
         **trust_figures(scene),
         "cameras": scene.cameras_from or PREDICTED,
         **({} if scene.frame is None else {"frame": scene.frame.name, "to_source": scene.frame.to_source.tolist()}),
+        **place_figures(scene.frame),
     }
 
 
@@ -346,6 +349,9 @@ def _target(output: str) -> str:
 _WRITERS: dict[str, Callable[[Scene, Path], Any]] = {
     "scene.ply": _scene_ply,
     "scene.spz": lambda scene, path: write_spz(path, scene.gaussians, scene.renderer.antialiased),
+    "scene.glb": lambda scene, path: write_gaussian_gltf(path, scene.gaussians),
+    "scene.gltf": lambda scene, path: write_gaussian_gltf(path, scene.gaussians),
+    "scene.spz.glb": lambda scene, path: write_gaussian_gltf(path, scene.gaussians, True, scene.renderer.antialiased),
     "scene.html": _page,
     "tiles": _tiles,
     "cameras.json": lambda scene, path: write_cameras_json(path, scene.named_cameras()),

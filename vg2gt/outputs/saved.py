@@ -15,8 +15,9 @@ from vg2gt.io.arrays import read_npz
 from vg2gt.io.cameras_json import NamedCamera
 from vg2gt.io.errors import FormatError
 from vg2gt.io.files import read_json
+from vg2gt.io.gaussian_files import READERS
 from vg2gt.outputs.output_names import PREDICTED
-from vg2gt.reconstruction.frame import SceneFrame
+from vg2gt.reconstruction.frame import SceneFrame, read_place
 from vg2gt.reconstruction.scene import Scene
 from vg2gt.rendering import Renderer
 from vg2gt.types import Cameras
@@ -61,7 +62,9 @@ def read_scene(folder: str | Path, renderer: Renderer, device: torch.device | st
         renderer=renderer_of(folder, renderer),
         metres_per_unit=report.get("metres_per_unit") if metres is None else metres,
         cameras_from="" if cameras_from == PREDICTED else cameras_from,
-        frame=None if similarity is None else SceneFrame(frame, similarity, None, frame),
+        frame=None
+        if similarity is None
+        else SceneFrame(frame, similarity, None, frame, read_place(report, similarity)),
         poses=poses,
     )
 
@@ -70,15 +73,15 @@ def scene_file(path: str | Path) -> Path:
     """Returns the scene's file if ``path`` is the folder of a scene, else ``path`` itself.
 
     Raises:
-        FileNotFoundError: if the folder has neither ``scene.ply`` nor ``scene.spz``.
+        FileNotFoundError: if the folder has no scene.
     """
     path = Path(path).expanduser()
     if not path.is_dir():
         return path
-    for name in ("scene.ply", "scene.spz"):
+    for name in (f"scene{suffix}" for suffix in READERS):
         if (path / name).is_file():
             return path / name
-    raise FileNotFoundError(f"{path} has no scene.ply or scene.spz: give a scene's file or a folder with one")
+    raise FileNotFoundError(f"{path} has no scene.ply: give a scene's file or a folder with one")
 
 
 def renderer_of(folder: Path, renderer: Renderer) -> Renderer:

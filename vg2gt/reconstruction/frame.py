@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -11,7 +12,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from vg2gt.geometry.alignment import Similarity, align_cameras
+from vg2gt.geometry.geodesy import Place
 from vg2gt.types import Cameras
+
+if TYPE_CHECKING:
+    from vg2gt.reconstruction.scene import Scene
 
 log = logging.getLogger(__name__)
 
@@ -31,17 +36,24 @@ class SceneFrame:
             predicted; its scale is source units per scene unit.
         poses: ``[V, 4, 4]`` float64 ``world_to_camera`` as given or found; None if the backbone predicted them.
         target: frame to write the scene in: ``given`` if cameras were given, else ``upright``.
+        place: where the source cameras are on the Earth; None if unknown.
     """
 
     name: str
     to_source: NDArray[np.float64]
     poses: NDArray[np.float64] | None = None
     target: str = "upright"
+    place: Place | None = None
 
     @property
     def scale(self) -> float:
         """Source units per scene unit."""
         return float(np.cbrt(np.linalg.det(self.to_source[:3, :3])))
+
+    @property
+    def world_place(self) -> Place | None:
+        """Where the scene's world is on the Earth; None if unknown."""
+        return None if self.place is None else replace(self.place, to_enu=self.place.to_enu @ self.to_source)
 
 
 def first_frame(cameras: Cameras, unit: float, poses: NDArray[np.float64] | None, target: str) -> SceneFrame:
@@ -86,7 +98,10 @@ def move_to_target(frame: SceneFrame, cameras: Cameras, depth: float) -> tuple[S
             )  # fmt: skip
             move[:3, 3] -= offset
     else:
-        move[:3, :3] = upright_rotation(cameras.world_to_camera[0].detach().cpu().double().numpy())
+        if (place := frame.world_place) is not None and place.is_level:
+            move[:3, :3] = _turned_down(-place.up)
+        else:
+            move[:3, :3] = upright_rotation(cameras.world_to_camera[0].detach().cpu().double().numpy())
     return replace(frame, name=frame.target, to_source=frame.to_source @ np.linalg.inv(move)), similarity_of(move)
 
 
@@ -105,6 +120,11 @@ def upright_rotation(poses: NDArray[np.float64]) -> NDArray[np.float64]:
     normal = vectors[:, 0] * np.sign(vectors[:, 0] @ down)
     if values[1] > 0.05 and values[0] < 0.3 * values[1] and normal @ down > 0.5:
         down = normal
+    return _turned_down(down)
+
+
+def _turned_down(down: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the smallest rotation ``[3, 3]`` that brings a direction of length 1 to +y."""
     axis, cosine = np.cross(down, [0, 1, 0]), down[1]
     if cosine < -0.999999:
         return np.diag([1.0, -1, -1])
@@ -134,3 +154,41 @@ def similarity_of(matrix: NDArray[np.float64]) -> Similarity:
     linear, shift = torch.from_numpy(matrix[:3, :3].copy()), torch.from_numpy(matrix[:3, 3].copy())
     scale = torch.linalg.det(linear) ** (1 / 3)
     return Similarity(scale[None], (linear / scale)[None], shift[None])
+
+
+def place_figures(frame: SceneFrame | None) -> dict[str, Any]:
+    """Returns the report entry ``gps`` of a scene, if its place on the Earth is known (:func:`read_place`).
+
+    ``origin``: latitude, longitude, altitude; ``to_enu``: from the scene's world to metres east, north and up of it;
+    ``up`` in the scene's world, null if the cameras are on one line; ``positions``: number; ``error`` in metres;
+    ``scale_error``: relative.
+    """
+    place = None if frame is None else frame.world_place
+    if place is None:
+        return {}
+    figures = {"positions": place.used, "error": place.error, "scale_error": place.scale_error}
+    up = place.up.tolist() if place.is_level else None
+    return {"gps": {"origin": list(place.origin), "to_enu": place.to_enu.tolist(), "up": up, **figures}}
+
+
+def read_place(figures: dict[str, Any], to_source: NDArray[np.float64]) -> Place | None:
+    """Returns the place that a report states (:func:`place_figures`), in the world of the source cameras."""
+    gps = figures.get("gps")
+    if gps is None:
+        return None
+    latitude, longitude, altitude = gps["origin"]
+    to_enu = np.array(gps["to_enu"]) @ np.linalg.inv(to_source)
+    known = (gps["error"], gps["scale_error"], gps["positions"], gps["up"] is not None)
+    return Place(to_enu, (latitude, longitude, altitude), *known)
+
+
+def place_lines(scene: Scene) -> list[str]:
+    """Describes in a line what GPS tells of a scene; nothing if it is unknown."""
+    place = None if scene.frame is None else scene.frame.place
+    if place is None:
+        return []
+    up = "up and the origin" if place.is_level else "the origin (not up: the cameras are on one line)"
+    return [
+        f"GPS of {place.used} photographs, off by {place.error:.1f} m: a unit is {scene.metres_per_unit:.4g} m, give "
+        f"or take {100 * place.scale_error:.1g} %; {up} are in report.json"
+    ]

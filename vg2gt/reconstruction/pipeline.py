@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,16 +14,21 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from vg2gt.geometry.cameras import camera_centers
+from vg2gt.geometry.geodesy import Place, fit_place
 from vg2gt.geometry.precision import half_precision_on_gpu
 from vg2gt.inputs.camera_source import CameraSource
 from vg2gt.inputs.cameras import Poses, pictures_for
+from vg2gt.inputs.folders import is_photo
 from vg2gt.inputs.inputs import Views, as_given, in_order, load_views, source_of, working_order, working_size
+from vg2gt.inputs.padding import padded
 from vg2gt.inputs.pictures import ImagesLike, Picture
 from vg2gt.io.files import by_number
+from vg2gt.io.image_files import gps_position
 from vg2gt.memory import RECONSTRUCTION, memory_advice, note_sizes
 from vg2gt.model import VG2GT, Reconstructor
 from vg2gt.monitor import Monitor
-from vg2gt.reconstruction.frame import first_frame, similarity_of
+from vg2gt.reconstruction.frame import SceneFrame, first_frame, similarity_of
 from vg2gt.reconstruction.scene import Scene
 from vg2gt.reconstruction.surroundings import with_surroundings
 from vg2gt.reconstruction.trust import pixel_trust
@@ -40,6 +46,8 @@ from vg2gt.reconstruction.windows.store import (
 from vg2gt.rendering import Renderer
 from vg2gt.types import Cameras, Gaussians, Geometry
 from vg2gt.uncertainty import Calibration
+
+log = logging.getLogger(__name__)
 
 
 @torch.no_grad()
@@ -93,6 +101,7 @@ def reconstruct_with(
     with memory_advice(RECONSTRUCTION), chosen as pictures:
         sizes = [picture.size for picture in pictures]
         target = anchor.size if anchor else working_size(sizes, model.backend.patch_size, device_of(model).type, size)
+        pictures = [padded(picture, target) for picture in pictures]
         note_sizes({f"images of {target[0]}x{target[1]}": len(pictures)})
         if images_at_a_time := window_size(window, len(pictures), keep_windows or anchor is not None):
             # memory-mapped files stay readable after their removal
@@ -148,7 +157,13 @@ def _scene(parts: _Parts, pictures: Sequence[Picture], renderer: Renderer, is_me
     given = np.stack(known) if source and len(known) == len(pictures) else None
     target = "given" if CameraSource.of(source) in (CameraSource.GIVEN, CameraSource.RECORDED) else "upright"
     frame = first_frame(geometry.cameras, float(parts.unit), given, target)
+    if parts.to_source is not None:
+        frame = replace(frame, to_source=parts.to_source)  # same for all sets, and their place is that of the first
+    else:
+        frame = replace(frame, place=_place(geometry.cameras, frame, pictures))
     metres = frame.scale if pictures[0].is_metric else None
+    if frame.world_place is not None and metres is None:
+        metres = frame.world_place.scale
     return Scene(
         gaussians=gaussians.detach(),
         cameras=geometry.cameras,
@@ -159,12 +174,26 @@ def _scene(parts: _Parts, pictures: Sequence[Picture], renderer: Renderer, is_me
         renderer=renderer,
         metres_per_unit=float(geometry.scale) if is_metric else metres,
         cameras_from=source,
-        frame=frame if parts.to_source is None else replace(frame, to_source=parts.to_source),  # same for all sets
+        frame=frame,
         mask=parts.mask,
         pictures=tuple(pictures),
         error=parts.error,
         support=parts.support,
     )
+
+
+def _place(cameras: Cameras, frame: SceneFrame, pictures: Sequence[Picture]) -> Place | None:
+    """Returns where the source cameras are on the Earth, by the positions that their photographs were taken at."""
+    files = [picture.path for picture in pictures]
+    found = [None if file is None or not is_photo(file) else gps_position(file) for file in files]
+    if not any(found):
+        return None
+    positions = np.array([(np.nan,) * 3 if each is None else each for each in found])
+    centers = camera_centers(cameras)[0].detach().cpu().double().numpy()
+    place = fit_place(centers @ frame.to_source[:3, :3].T + frame.to_source[:3, 3], positions)
+    if place is None:
+        log.warning("the GPS positions of the photographs are too few or too coarse to give the scene a scale")
+    return place
 
 
 def add_images(
@@ -257,6 +286,8 @@ def _joined(old: Scene, new: Scene) -> Scene:
         mask=None if old.mask is None and new.mask is None else both(*masks),
         names=(*old.names, *new.names),
         renderer=old.renderer,
+        metres_per_unit=old.metres_per_unit,
+        frame=new.frame if new.frame is None or old.frame is None else replace(new.frame, place=old.frame.place),
         poses=None if old.poses is None or new.poses is None else both(old.poses, new.poses),
         **{name: both(getattr(old, name), getattr(new, name)) for name in ("images", "depth", "depth_conf")},
     )

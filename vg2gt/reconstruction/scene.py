@@ -187,6 +187,16 @@ class Scene:
 
         return refine_scene(self, replace(options or refinement_for(self, quality, **changes), **changes))
 
+    def cut_to_object(self) -> Scene:
+        """Returns the scene without what surrounds the object that its cameras look at.
+
+        Raises:
+            ValueError: if they do not look at one place.
+        """
+        from vg2gt.reconstruction.cutout import cut_to_object
+
+        return cut_to_object(self)
+
     def save(
         self,
         folder: str | Path,

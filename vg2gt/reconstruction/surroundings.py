@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from vg2gt.geometry.cameras import unproject
+from vg2gt.inputs.padding import without_padding
 from vg2gt.inputs.pictures import spread
 from vg2gt.method.additions.far_shell import far_shell
 from vg2gt.method.additions.hull import Meaning, meaning_of, outside_hull
@@ -43,7 +44,8 @@ def with_surroundings(scene: Scene, shell: bool = True) -> Scene:
     if far is None:
         return scene
     if meaning.share is not None and scene.mask is not None:
-        far = far.select(~outside_hull(far.means, scene.cameras.to("cpu"), scene.mask, meaning.share))
+        seen = without_padding(scene.mask)
+        far = far.select(~outside_hull(far.means, scene.cameras.to("cpu"), seen, meaning.share))
     return replace(scene, gaussians=scene.gaussians.joined(far.to(scene.gaussians.means.device)))
 
 
@@ -55,14 +57,15 @@ def without_debris(scene: Scene) -> Scene:
 def _meaning(scene: Scene) -> Meaning:
     if scene.mask is None:
         return Meaning(None, False)
-    return meaning_of(scene.depth, scene.cameras.to("cpu"), scene.mask)
+    return meaning_of(scene.depth, scene.cameras.to("cpu"), without_padding(scene.mask))
 
 
 def _carved(scene: Scene, meaning: Meaning) -> Scene:
     """Returns the scene without Gaussians and depth outside of the masks, if these say that nothing is there."""
     if meaning.share is None or scene.mask is None:
         return scene
-    inside = ~outside_hull(scene.gaussians.means, scene.cameras, scene.mask, meaning.share)
+    mask = without_padding(scene.mask)
+    inside = ~outside_hull(scene.gaussians.means, scene.cameras, mask, meaning.share)
     if inside.float().mean() < _LEAST_LEFT:
         log.warning("the masks of the views contradict each other: nothing is left that all of them show; not applied")
         return scene
@@ -71,5 +74,5 @@ def _carved(scene: Scene, meaning: Meaning) -> Scene:
     for view, own in enumerate(depth):
         seen = own > 0
         world = unproject(own[None, None], cameras.select(slice(view, view + 1)))[0, 0][seen]
-        own[seen] *= ~outside_hull(world, cameras.select(some), scene.mask[some], meaning.share)
+        own[seen] *= ~outside_hull(world, cameras.select(some), mask[some], meaning.share)
     return replace(scene, gaussians=scene.gaussians.select(inside), depth=depth)

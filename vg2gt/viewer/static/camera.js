@@ -70,6 +70,14 @@ class View {
     if (!onTheSpot) this.center = addScaled(ahead, forward, -this.pivot);
   }
 
+  // Sets the direction up, and turns the view upright unless it looks along it.
+  level(up) {
+    const forward = this.axes[2], right = cross(up.map((value) => -value), forward);
+    this.up = up;
+    if (Math.hypot(...right) < 0.01) return;
+    this.axes = [unit(right), cross(forward, unit(right)), forward];
+  }
+
   // Moves along the view's own axes, scene units.
   move(right, down, forward) {
     [right, down, forward].forEach((step, k) => { this.center = addScaled(this.center, this.axes[k], step); });

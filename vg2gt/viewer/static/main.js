@@ -23,7 +23,7 @@ async function start() {
 
   const up = records.map(fromRecord).reduce((sum, { axes }) => addScaled(sum, axes[1], -1), [0, 0, 0]);
   const view = new View(Math.hypot(...up) > 0.1 ? unit(up) : [0, -1, 0]);
-  const show = { frusta: false, images: false };
+  const show = { frusta: false, images: false }, crop = { box: null };
   let version = 0, drawn = -1, busy = false, waiting = [];
 
   // Sorts for the newest view and draws; in between frames show the newest view in an older order. The first one is
@@ -32,7 +32,7 @@ async function start() {
     busy = true;
     while (drawn < version) {
       const now = version, axis = [...view.axes[2], view.translation()[2]], near = scene.settings.near;
-      renderer.setOrder(drawn < 0 ? makeDepthSorter(means)(axis, near) : await sorter.sort(axis, near));
+      renderer.setOrder(drawn < 0 ? makeDepthSorter(means)(axis, near) : await sorter.sort(axis, near, crop.box));
       paint();
       drawn = now;
     }
@@ -78,6 +78,7 @@ async function start() {
   }
 
   const follow = connect({ canvas, view, changed, resized, setCamera, show, records, scene, pictures });
+  connectTools({ canvas, view, changed, renderer, scene, geometry, means, crop });
   await follow(0);
   viewer.loadSeconds = (performance.now() - started) / 1000;
   return setCamera;

@@ -144,6 +144,35 @@ class Renderer {
     this.bind(0, this.image);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
     if (this.frusta && (frusta || images)) this.drawFrusta(view, frusta, images);
+    if (this.marks) this.drawMarks(view);
+  }
+
+  // Crosses at points, and lines between them; size: that of a unit on the screen.
+  setMarks(points, size) {
+    const gl = this.gl, lines = points.length > 1 ? [points[0], points[1]] : [];
+    for (const point of points) {
+      for (const axis of [[1, 0, 0], [0, 1, 0], [0, 0, 1]]) {
+        for (const side of [-0.01, 0.01]) lines.push(addScaled(point, axis, side * size));
+      }
+    }
+    this.marks = lines.length;
+    this.markArray ??= gl.createVertexArray();
+    this.markBuffer ??= gl.createBuffer();
+    gl.bindVertexArray(this.markArray);
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.markBuffer);
+    gl.bufferData(gl.ARRAY_BUFFER, new Float32Array(lines.flat()), gl.DYNAMIC_DRAW);
+    gl.enableVertexAttribArray(0);
+    gl.vertexAttribPointer(0, 3, gl.FLOAT, false, 12, 0);
+  }
+
+  drawMarks(view) {
+    const gl = this.gl, { uniforms } = this.overlay;
+    this.usePose(this.overlay, view);
+    gl.uniform1f(uniforms.near, this.settings.near);
+    gl.uniform1i(uniforms.textured, 0);
+    gl.uniform4f(uniforms.color, 0.3, 1.0, 0.5, 1.0);
+    gl.bindVertexArray(this.markArray);
+    gl.drawArrays(gl.LINES, 0, this.marks);
   }
 
   bind(place, texture) {

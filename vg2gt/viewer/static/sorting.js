@@ -1,17 +1,20 @@
 // Back-to-front order by the depth of the means, exact in float32: positive floats sort like their bits. Of equal depths
 // the later Gaussian is the farther one.
 
-// Self-contained, because a worker gets its source text. axis: third row of world_to_camera, four numbers.
+// Self-contained, because a worker gets its source text. axis: third row of world_to_camera, four numbers; box: low and
+// high corners of what is shown, null: everything.
 function makeDepthSorter(means) {
   const count = means.length / 3;
   const depths = new Float32Array(count), bits = new Uint32Array(depths.buffer);
   const first = new Uint32Array(count), second = new Uint32Array(count);
-  return (axis, near) => {
+  return (axis, near, box) => {
+    const [lx, ly, lz, hx, hy, hz] = box ?? [-Infinity, -Infinity, -Infinity, Infinity, Infinity, Infinity];
     const [ax, ay, az, at] = axis;
     let visible = 0;
     for (let i = count - 1; i >= 0; i--) {
-      depths[i] = ax * means[3 * i] + ay * means[3 * i + 1] + az * means[3 * i + 2] + at;
-      if (depths[i] > near) first[visible++] = i;
+      const x = means[3 * i], y = means[3 * i + 1], z = means[3 * i + 2];
+      depths[i] = ax * x + ay * y + az * z + at;
+      if (depths[i] > near && x >= lx && x <= hx && y >= ly && y <= hy && z >= lz && z <= hz) first[visible++] = i;
     }
     const pass = (from, to, shift) => {
       const starts = new Uint32Array(65537);
@@ -34,7 +37,7 @@ class DepthSorter {
         let sort;
         onmessage = ({ data }) => {
           if (data.means) { sort = makeDepthSorter(data.means); return; }
-          const order = sort(data.axis, data.near);
+          const order = sort(data.axis, data.near, data.box);
           postMessage(order, [order.buffer]);
         };`;
       this.worker = new Worker(URL.createObjectURL(new Blob([source], { type: "text/javascript" })));
@@ -49,14 +52,14 @@ class DepthSorter {
   fallBack(means) {
     this.worker = null;
     this.sortHere = makeDepthSorter(means);
-    for (const { axis, near, resolve } of this.waiting.splice(0)) resolve(this.sortHere(axis, near));
+    for (const { axis, near, box, resolve } of this.waiting.splice(0)) resolve(this.sortHere(axis, near, box));
   }
 
-  sort(axis, near) {
-    if (!this.worker) return Promise.resolve(this.sortHere(axis, near));
+  sort(axis, near, box) {
+    if (!this.worker) return Promise.resolve(this.sortHere(axis, near, box));
     return new Promise((resolve) => {
-      this.waiting.push({ axis, near, resolve });
-      this.worker.postMessage({ axis, near });
+      this.waiting.push({ axis, near, box, resolve });
+      this.worker.postMessage({ axis, near, box });
     });
   }
 }

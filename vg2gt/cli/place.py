@@ -1,0 +1,92 @@
+"""``vg2gt place``: says how large a scene is, or where it is on the Earth, from points in it (docs/guides/view.md)."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vg2gt.cli.arguments import flag_parser
+from vg2gt.cli.errors import errors_in_one_line
+
+if TYPE_CHECKING:
+    from vg2gt.geometry.geodesy import Place
+
+_UNITS = {"mm": 0.001, "cm": 0.01, "m": 1.0, "km": 1000.0, "in": 0.0254, "ft": 0.3048}
+_SCALE = re.compile(rf"(.+)=\s*([\d.eE+-]+)\s*({'|'.join(_UNITS)})")
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Runs the command; errors are reported in one line."""
+    parser = flag_parser("place")
+    add = parser.add_argument
+    add("scene", type=Path, metavar="DIR", help="a folder that vg2gt reconstruct has written")
+    how = parser.add_mutually_exclusive_group(required=True).add_argument
+    how("--scale", type=_scale, metavar="A,B=1.2m", help="two points of the scene, as the page's Measure shows "
+        f"them, and their distance in {', '.join(_UNITS)}")  # fmt: skip
+    how("--control", type=Path, metavar="FILE", help="control points: a CSV with a line x,y,z,latitude,longitude,"
+        "altitude for each of three or more points, in the scene's frame, degrees and metres")  # fmt: skip
+    with errors_in_one_line():
+        run(parser.parse_args(argv))
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Changes ``cameras.json`` and ``report.json``; the Gaussians stay as they are."""
+    import numpy as np
+
+    from vg2gt.io import read_cameras_json, write_cameras_json
+    from vg2gt.io.files import read_json, write_json
+    from vg2gt.reconstruction.frame import SceneFrame, place_figures
+
+    cameras, report = (arguments.scene / name for name in ("cameras.json", "report.json"))
+    named, figures = read_cameras_json(cameras), read_json(report) if report.is_file() else {}
+    metres, said = arguments.scale, ""
+    if arguments.control is not None:
+        place = _control(arguments.control)
+        metres, said = place.scale, f"; control points are off by {place.error:.3g} m (median)"
+        figures |= place_figures(SceneFrame("given", np.eye(4), place=place))
+    elif "gps" in figures and abs(figures["metres_per_unit"] / metres - 1) > 0.01:
+        del figures["gps"]  # its transform has another scale
+        said = "; the place by GPS, which has another scale, is removed"
+    write_json(report, figures | {"metres_per_unit": metres})
+    write_cameras_json(cameras, [replace(camera, metres_per_unit=metres) for camera in named])
+    print(f"a unit of {arguments.scene} is {metres:.4g} m{said}")
+
+
+def _scale(text: str) -> float:
+    """Returns the metres per unit that two points and their distance give."""
+    found = _SCALE.fullmatch(text.strip())
+    try:
+        values = [float(part) for part in found[1].split(",")] if found else []
+        length = float(found[2]) * _UNITS[found[3]] if found else 0.0
+    except ValueError:
+        values, length = [], 0.0
+    if len(values) != 6 or not all(map(math.isfinite, [*values, length])) or length <= 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is not two points and a distance, such as 0,0,1,0.5,0,1=1.2m")
+    distance = math.dist(values[:3], values[3:])
+    if not distance > 0:
+        raise argparse.ArgumentTypeError("the two points are the same")
+    return length / distance
+
+
+def _control(file: Path) -> Place:
+    """Returns the place that a file of control points gives."""
+    import numpy as np
+
+    from vg2gt.geometry.geodesy import place_of_points
+
+    expected = f"{file}: expected three or more lines x,y,z,latitude,longitude,altitude"
+    try:
+        rows = np.loadtxt(file, delimiter=",", ndmin=2)
+    except ValueError as error:
+        raise ValueError(f"{expected} ({error})") from error
+    if rows.shape[1] != 6 or len(rows) < 3 or not np.isfinite(rows).all():
+        raise ValueError(f"{expected}, got {len(rows)} of {rows.shape[1]} numbers")
+    place = place_of_points(rows[:, :3], rows[:, 3:])
+    if not place.is_level:
+        raise ValueError(f"{file}: the control points are on one line, or do not fit each other ({place.error:.3g} m)")
+    return place

@@ -1,0 +1,134 @@
+"""Positions on the Earth: latitude, longitude and altitude in metres; the place of a scene by its cameras' GPS."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from vg2gt.geometry.alignment import align_points
+
+_EQUATOR, _FLATTENING = 6378137.0, 1 / 298.257223563  # WGS 84, radius in metres
+_FEWEST = 4  # positions
+_DRAWS = 300
+_AGREE = 0.8  # share of the positions that a candidate must fit
+_WITHIN = 3.0  # median distances up to which a position counts
+_SURE = 0.05  # metres within which it always does
+_COARSE = 0.05  # largest relative error of the scale
+_LINE = 1e-3  # width of the positions, relative to their length, up to which they are on a line
+_TILT = 0.05  # largest standard error of the turn about that line, in radians
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """Where cameras are on the Earth.
+
+    Attributes:
+        to_enu: ``[4, 4]`` float64 similarity from the cameras' world to metres east, north and up of the origin.
+        origin: latitude and longitude in degrees (WGS 84), altitude in metres.
+        error: median distance between the cameras and their measured positions, in metres.
+        scale_error: estimated relative standard error of the scale.
+        used: number of positions that agree.
+        is_level: whether the positions determine the direction up; cameras on one line do not.
+    """
+
+    to_enu: NDArray[np.float64]
+    origin: tuple[float, float, float]
+    error: float
+    scale_error: float
+    used: int
+    is_level: bool
+
+    @property
+    def scale(self) -> float:
+        """Metres per unit of the cameras' world."""
+        return float(np.cbrt(np.linalg.det(self.to_enu[:3, :3])))
+
+    @property
+    def up(self) -> NDArray[np.float64]:
+        """Direction up ``[3]`` in the cameras' world, of length 1."""
+        return self.to_enu[2, :3] / self.scale
+
+
+def enu(positions: NDArray[np.float64], origin: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Converts positions to metres east, north and up of an origin.
+
+    Args:
+        positions: ``[N, 3]`` latitude and longitude in degrees (WGS 84), altitude in metres.
+        origin: ``[3]``, likewise.
+
+    Returns:
+        ``[N, 3]``.
+    """
+    # its columns are up, east and north
+    turn = Rotation.from_euler("ZY", [origin[1], -origin[0]], degrees=True).as_matrix()
+    up_east_north = (_earth_centred(positions) - _earth_centred(origin[None])) @ turn
+    return up_east_north[:, [1, 2, 0]]
+
+
+def fit_place(centers: NDArray[np.float64], positions: NDArray[np.float64]) -> Place | None:
+    """Fits a similarity from camera centres to measured positions; outliers do not count.
+
+    Candidates are the similarities of three cameras each; the one that fits four fifths of the positions best is fitted
+    again to all positions within three times the median distance.
+
+    Args:
+        centers: ``[N, 3]`` in the cameras' world.
+        positions: ``[N, 3]`` latitude, longitude, altitude; NaN where unknown.
+
+    Returns:
+        The place; None if there are fewer than four positions, or they are too coarse for the cameras' distances: the
+        relative error of the scale would exceed 5 %.
+    """
+    known = np.isfinite(positions).all(1)
+    if known.sum() < _FEWEST:
+        return None
+    origin = np.median(positions[known], 0)
+    source, target = (torch.from_numpy(each) for each in (centers[known], enu(positions[known], origin)))
+    generator = torch.Generator().manual_seed(0)
+    draws = torch.stack([torch.randperm(len(source), generator=generator)[:3] for _ in range(_DRAWS)])
+    candidates = align_points(source[draws], target[draws])
+    distances = (candidates.apply(source.expand(_DRAWS, -1, -1)) - target).norm(dim=-1)
+    distance = distances[distances.quantile(_AGREE, 1, interpolation="higher").nan_to_num(torch.inf).argmin()]
+    near = distance <= (_WITHIN * distance.median()).clamp(min=_SURE)
+    for _ in range(3):
+        fit = align_points(source[None, near], target[None, near])
+        distance = (fit.apply(source[None]) - target).norm(dim=-1)[0]
+        near = distance <= (_WITHIN * distance.median()).clamp(min=_SURE)
+    place = place_of_points(source[near].numpy(), positions[known][near.numpy()])
+    return place if place.scale_error <= _COARSE else None
+
+
+def place_of_points(points: NDArray[np.float64], positions: NDArray[np.float64]) -> Place:
+    """Fits a similarity from at least three points to their positions, all of which count.
+
+    Args:
+        points: ``[N, 3]``.
+        positions: ``[N, 3]`` latitude, longitude, altitude of the same points.
+    """
+    origin = np.median(positions, 0)
+    source, target = torch.from_numpy(points), torch.from_numpy(enu(positions, origin))
+    fit = align_points(source[None], target[None])
+    distance = (fit.apply(source[None]) - target).norm(dim=-1)[0]
+    spread = torch.linalg.svdvals(target - target.mean(0))
+    scale_error = float(distance.square().mean().sqrt() / spread[:2].norm()) if spread[0] > 0 else float("inf")
+    matrix = np.eye(4)
+    matrix[:3, :3] = float(fit.scale[0]) * fit.rotation[0].numpy()
+    matrix[:3, 3] = fit.translation[0].numpy()
+    noise = float(distance.square().mean().sqrt()) / 3**0.5  # along an axis
+    is_level = bool(spread[1] > max(_LINE * float(spread[0]), noise / _TILT))
+    latitude, longitude, altitude = origin.tolist()
+    return Place(matrix, (latitude, longitude, altitude), float(distance.median()), scale_error, len(points), is_level)
+
+
+def _earth_centred(positions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Converts latitude, longitude and altitude ``[N, 3]`` to metres from the Earth's centre."""
+    latitude, longitude, altitude = np.radians(positions[:, 0]), np.radians(positions[:, 1]), positions[:, 2]
+    squared = _FLATTENING * (2 - _FLATTENING)  # eccentricity
+    radius = _EQUATOR / np.sqrt(1 - squared * np.sin(latitude) ** 2)
+    across = (radius + altitude) * np.cos(latitude)
+    polar = (radius * (1 - squared) + altitude) * np.sin(latitude)
+    return np.stack([across * np.cos(longitude), across * np.sin(longitude), polar], 1)
