@@ -27,8 +27,8 @@ class Monitor:
     Args:
         show: draw progress bars on the standard error stream.
         device: device to synchronise with and to measure the memory of.
-        watch: called after every step of a refinement with a function that returns the current Gaussians and cameras; None: nobody
-            watches (:class:`vg2gt.viewer.live.LiveView`).
+        watch: called after every step of a refinement with a function that returns the current Gaussians and cameras
+            (:class:`vg2gt.viewer.live.LiveView`); None: nobody watches.
 
     Attributes:
         seconds: wall time by stage, in the order of their first start. Repeated stages add up; the time of a nested
