@@ -28,16 +28,14 @@ def with_gps(path, position) -> Image.Exif:
     for angle in np.abs(position[:2]):
         minutes = angle % 1 * 60
         parts.append((float(int(angle)), float(int(minutes)), minutes % 1 * 60))
-    exif.get_ifd(ExifTags.IFD.GPSInfo).update(
-        {
-            tags.GPSLatitudeRef: "N" if position[0] > 0 else "S",
-            tags.GPSLatitude: parts[0],
-            tags.GPSLongitudeRef: "E" if position[1] > 0 else "W",
-            tags.GPSLongitude: parts[1],
-            tags.GPSAltitudeRef: b"\0" if position[2] > 0 else b"\1",
-            tags.GPSAltitude: abs(position[2]),
-        }
-    )
+    exif[ExifTags.IFD.GPSInfo] = {
+        tags.GPSLatitudeRef: "N" if position[0] > 0 else "S",
+        tags.GPSLatitude: parts[0],
+        tags.GPSLongitudeRef: "E" if position[1] > 0 else "W",
+        tags.GPSLongitude: parts[1],
+        tags.GPSAltitudeRef: b"\0" if position[2] > 0 else b"\1",
+        tags.GPSAltitude: abs(position[2]),
+    }
     with Image.open(path) as image:
         image.load()
         image.save(path, exif=exif)

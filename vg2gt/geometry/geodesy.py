@@ -93,13 +93,18 @@ def fit_place(centers: NDArray[np.float64], positions: NDArray[np.float64]) -> P
     candidates = align_points(source[draws], target[draws])
     distances = (candidates.apply(source.expand(_DRAWS, -1, -1)) - target).norm(dim=-1)
     distance = distances[distances.quantile(_AGREE, 1, interpolation="higher").nan_to_num(torch.inf).argmin()]
-    near = distance <= (_WITHIN * distance.median()).clamp(min=_SURE)
+    near = _agreeing(distance)
     for _ in range(3):
         fit = align_points(source[None, near], target[None, near])
-        distance = (fit.apply(source[None]) - target).norm(dim=-1)[0]
-        near = distance <= (_WITHIN * distance.median()).clamp(min=_SURE)
+        near = _agreeing((fit.apply(source[None]) - target).norm(dim=-1)[0])
     place = place_of_points(source[near].numpy(), positions[known][near.numpy()])
     return place if place.scale_error <= _COARSE else None
+
+
+def _agreeing(distance: torch.Tensor) -> torch.Tensor:
+    """Returns which positions count, by their distances ``[N]``: four fifths of them in any case."""
+    limit = torch.maximum(_WITHIN * distance.median(), distance.quantile(_AGREE, interpolation="higher"))
+    return distance <= limit.clamp(min=_SURE)
 
 
 def place_of_points(points: NDArray[np.float64], positions: NDArray[np.float64]) -> Place:
