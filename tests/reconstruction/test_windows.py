@@ -108,10 +108,10 @@ def test_an_interrupted_run_goes_on(model, walk, whole, tmp_path, monkeypatch) -
     calls = model.backend._calls
     pool, pooled = model.fine.pool, []
 
-    def stop(*inputs):
+    def stop(*inputs, capped):
         if len(pooled) == 2:
             raise KeyboardInterrupt
-        pooled.append(pool(*inputs))
+        pooled.append(pool(*inputs, capped=capped))
         return pooled[-1]
 
     monkeypatch.setattr(model.fine, "pool", stop)
