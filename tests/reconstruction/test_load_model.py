@@ -124,7 +124,7 @@ def test_weights_of_a_diverged_training_are_refused(run_folder: Path, tmp_path: 
 
 
 def test_python_interface(run_folder: Path, recording: Path, tmp_path: Path) -> None:
-    model = vg2gt.load(run_folder, overrides=["renderer.alpha_max=0.9"], device="cpu")
+    model = vg2gt.load(run_folder, overrides=["+renderer.alpha_max=0.9"], device="cpu")
     scene = model.reconstruct(recording, size=56, max_images=2)
     assert scene.renderer.alpha_max == 0.9
     assert isinstance(scene, vg2gt.Scene)

@@ -86,7 +86,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     from vg2gt.runs.load import choose_device
 
     options.out = str(Path(options.out).expanduser())
-    how_to_refine = [each for each in overrides if each.startswith(("refine=", "refine."))]
+    how_to_refine = [each for each in overrides if each.lstrip("+").startswith(("refine=", "refine."))]
     overrides = [each for each in overrides if each not in how_to_refine]
     _check(options, overrides)
     check_refinement(options.refine, options.quality, how_to_refine)

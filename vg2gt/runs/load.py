@@ -177,6 +177,7 @@ def resolve_parts(config: DictConfig, checkpoint: Path | None) -> dict[str, Dict
         learned = "backend" in parts and not parts["backend"]["_target_"].endswith("OracleBackend")
         model = ["model=tiny_ungated"] if learned else []
         run = compose("train", "output_dir=.", *model) if checkpoint is None else _config_of(checkpoint, missing)
+        OmegaConf.set_struct(run, False)  # +key=value gives arguments that the files leave at their default
         parts |= {part: OmegaConf.merge(run[part], given[part] or {}) for part in missing}
     if checkpoint is not None and given["backend"] is not None:
         refuse_other_tokens(parts["backend"], read_checkpoint(checkpoint), checkpoint)
