@@ -105,7 +105,7 @@ def load_model(
         ImportError: if the backend needs a package that is not installed.
         ValueError: if a name or an option is unknown, or the checkpoint belongs to another backbone.
     """
-    checkpoint, parts = model_parts(ckpt, [*([f"backend={backend}"] if backend else []), *overrides])
+    checkpoint, parts = _model_parts(ckpt, [*([f"backend={backend}"] if backend else []), *overrides])
     try:
         built = build_model(parts, seed, choose_device(device))
         renderer: Renderer = instantiate(parts["renderer"])
@@ -121,7 +121,7 @@ def load_model(
     return LoadedModel(built, replace(renderer, mode="solid", depth="median"), weights, known)
 
 
-def model_parts(ckpt: str | Path | None, overrides: Sequence[str]) -> tuple[Path | None, dict[str, DictConfig]]:
+def _model_parts(ckpt: str | Path | None, overrides: Sequence[str]) -> tuple[Path | None, dict[str, DictConfig]]:
     """Returns the checkpoint and the configurations of backend, model and renderer for :func:`load_model`."""
     keys = [override.partition("=")[0].lstrip("+~") for override in overrides]
     for override, key in zip(overrides, keys, strict=True):
@@ -154,7 +154,7 @@ def model_parts(ckpt: str | Path | None, overrides: Sequence[str]) -> tuple[Path
 def backend_class(ckpt: str | Path | None, overrides: Sequence[str]) -> type:
     """Returns the class of the backend that :func:`load_model` would build; ``object`` if it cannot be imported."""
     try:
-        return get_class(model_parts(ckpt, overrides)[1]["backend"]["_target_"])
+        return get_class(_model_parts(ckpt, overrides)[1]["backend"]["_target_"])
     except ImportError:
         return object
 
