@@ -195,6 +195,8 @@ def _neighbourhood(partners: Tensor, views: Tensor) -> tuple[Tensor, Tensor]:
 
     The added views have no partners themselves (-1).
     """
+    if len(views) == len(partners):
+        return views, partners
     named = partners[views].flatten()
     chosen = torch.cat((views, named[(named >= 0) & ~torch.isin(named, views)].unique()))
     place = partners.new_full((len(partners) + 1,), -1)
