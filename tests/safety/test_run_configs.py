@@ -14,7 +14,7 @@ from vg2gt.config import config_dir
 from vg2gt.evaluation.checks import refuse_training_views
 from vg2gt.runs.checkpoints import MADE_OF
 from vg2gt.runs.load import load_model
-from vg2gt.runs.trust import ENVIRONMENT, UntrustedError, check_targets
+from vg2gt.runs.untrusted import ENVIRONMENT, UntrustedError, check_targets
 from vg2gt.studies.study import _refuse_other_run
 from vg2gt.training.start import name_differences
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from vg2gt.kernels.point_moments import moments_in_one_pass
+from vg2gt.kernels.moments import moments_in_one_pass
 from vg2gt.kernels.threads import compilable
 from vg2gt.method.grid import VoxelPlan, pool_mean_of_chunks
 
