@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from vg2gt.data.sources.masks import mask_beside
 from vg2gt.geometry.cameras import scale_translations, strided_intrinsics
 from vg2gt.geometry.precision import half_precision_on_gpu
 from vg2gt.inputs.inputs import thumbnails, working_order
@@ -27,7 +25,7 @@ from vg2gt.reconstruction.windows.placement import (
     place_windows,
     seen_from,
 )
-from vg2gt.reconstruction.windows.store import Capture, Window, WindowStore, cut, key_of, merge_windows, remove
+from vg2gt.reconstruction.windows.store import Capture, Window, WindowStore, cut, merge_windows, remove, set_key
 from vg2gt.types import Cameras, Gaussians, Geometry, Tokens
 from vg2gt.visibility.check import choose_partners
 
@@ -227,21 +225,6 @@ class WindowRun:
         with self.monitor.stage("Gaussians"), half_precision_on_gpu(torch.empty(0, device=self.device)):
             pooled = self.model.fine.limited(pooled.to(self.device))
             return self.model.finish(pooled, size.to(self.device), (total, weight))[1]
-
-
-def set_key(model: VG2GT, pictures: Sequence[Picture], size: tuple[int, int], window: int) -> str:
-    """Returns the key of a set of pictures for this model, working and window size."""
-    return key_of(model, [_facts(each) for each in pictures], size, window)
-
-
-def _facts(picture: Picture) -> list[Any]:
-    """Returns what identifies a picture's content and camera, as JSON values."""
-    path = picture.path
-    files = [path, None if path is None else mask_beside(path), picture.container]
-    states = [file.stat() for file in files if file is not None]
-    matrices = [None if each is None else each.tolist() for each in (picture.pose, picture.intrinsics)]
-    stamps = [[state.st_size, state.st_mtime_ns] for state in states]
-    return [picture.name, picture.size, picture.source, picture.lens, matrices, stamps]
 
 
 def _summary(views: Tensor, tokens: Tokens, geometry: Geometry) -> dict[str, Tensor]:

@@ -12,6 +12,7 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,6 +21,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from vg2gt.data.sources.masks import mask_beside
 from vg2gt.inputs.inputs import depth_range, given_poses, load_views, map_shift, source_of
 from vg2gt.inputs.pictures import Picture
 from vg2gt.io.errors import FormatError
@@ -92,9 +94,10 @@ class WindowStore:
             return None
 
 
-def key_of(model: Reconstructor, *facts: object) -> str:
-    """Returns a hash of a model's weights and options, and of further facts (JSON values)."""
-    digest = hashlib.sha256(json.dumps([FORMAT, model.backend.identity(), facts]).encode())
+def set_key(model: Reconstructor, pictures: Sequence[Picture], size: tuple[int, int], window: int) -> str:
+    """Returns a hash of the model's weights and options, the pictures, and the working and window size."""
+    facts = [FORMAT, model.backend.identity(), [_facts(each) for each in pictures], size, window]
+    digest = hashlib.sha256(json.dumps(facts).encode())
     for name, module in model.named_modules():
         options = {key: value for key, value in vars(module).items() if isinstance(value, _PLAIN) and key[0] != "_"}
         options.pop("training", None)
@@ -104,6 +107,16 @@ def key_of(model: Reconstructor, *facts: object) -> str:
         digest.update(name.encode())
         digest.update(tensor.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes())
     return digest.hexdigest()
+
+
+def _facts(picture: Picture) -> list[Any]:
+    """Returns what identifies a picture's content and camera, as JSON values."""
+    path = picture.path
+    files = [path, None if path is None else mask_beside(path), picture.container]
+    states = [file.stat() for file in files if file is not None]
+    matrices = [None if each is None else each.tolist() for each in (picture.pose, picture.intrinsics)]
+    stamps = [[state.st_size, state.st_mtime_ns] for state in states]
+    return [picture.name, picture.size, picture.source, picture.lens, matrices, stamps]
 
 
 def merge_windows(files: Sequence[Path], monitor: Monitor, limit: int = ROWS) -> PooledVoxels:
