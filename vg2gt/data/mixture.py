@@ -105,7 +105,7 @@ def _make(name: str, part: SceneSource | SourceMaker, names: Sequence[str], comm
     owners = {key: _owner(key, names) for key in common}
     own = {key.removeprefix(f"{name}_"): common[key] for key, owner in owners.items() if owner == name}
     shared = {key: common[key] for key, owner in owners.items() if owner is None}
-    if "root" in own and not own["root"]:
+    if not isinstance(part, SceneSource) and "root" in own and not own["root"]:
         raise FileNotFoundError(
             f"data.{name}_root is not set: name the dataset's folder, or leave it out with data.weights.{name}=0"
         )

@@ -20,7 +20,7 @@ def _legs(b: Builder, x: float, y: float, height: float, thickness: float, mater
             b.box((sx * x, sy * y, height / 2), (thickness, thickness, height), material)
 
 
-def _crates(b: Builder) -> float:
+def crates(b: Builder) -> float:
     """One box, or two stacked boxes."""
     size = b.rng.uniform(0.3, 0.9, 3)
     b.box((0, 0, size[2] / 2), tuple(size), b.new_material())
@@ -71,7 +71,7 @@ def chair(b: Builder) -> float:
     return 0.35
 
 
-def _shelf(b: Builder) -> float:
+def shelf(b: Builder) -> float:
     """A shelf with books; every board is a separate group."""
     rng = b.rng
     width, height, boards = rng.uniform(0.7, 1.3), rng.uniform(0.9, 2.0), int(rng.integers(2, 5))
@@ -117,7 +117,7 @@ def lamp(b: Builder) -> float:
     return 0.25
 
 
-def _plant(b: Builder) -> float:
+def plant(b: Builder) -> float:
     """A pot with leaves."""
     rng = b.rng
     pot, height = rng.uniform(0.12, 0.22), rng.uniform(0.2, 0.4)
@@ -130,7 +130,7 @@ def _plant(b: Builder) -> float:
     return 0.35
 
 
-def _cabinet(b: Builder) -> float:
+def cabinet(b: Builder) -> float:
     """A chest with drawers and knobs."""
     rng = b.rng
     width, height, rows = rng.uniform(0.6, 1.2), rng.uniform(0.6, 1.3), int(rng.integers(2, 5))
@@ -145,5 +145,5 @@ def _cabinet(b: Builder) -> float:
 
 
 MAKERS: tuple[Callable[[Builder], float], ...] = (
-    _crates, barrel, ball, table, chair, _shelf, sofa, lamp, _plant, _cabinet,
+    crates, barrel, ball, table, chair, shelf, sofa, lamp, plant, cabinet,
 )  # fmt: skip
