@@ -17,7 +17,7 @@ POSITION_WEIGHT = 0.1
 HIDDEN = 32
 
 
-class ResidualUnit(nn.Module):
+class _ResidualUnit(nn.Module):
     """Two 3x3 convolutions with ReLU before each, added to x, or to ``relu(x)`` with ``rectified_skip`` (VGGT)."""
 
     def __init__(self, channels: int, rectified_skip: bool) -> None:
@@ -33,14 +33,14 @@ class ResidualUnit(nn.Module):
         return change + (rectified if self.rectified_skip else x)
 
 
-class Fusion(nn.Module):
+class _Fusion(nn.Module):
     """Adds a finer map to a coarser one, refines and upsamples the sum."""
 
     def __init__(self, channels: int, rectified_skip: bool, has_finer: bool = True) -> None:
         super().__init__()
         if has_finer:
-            self.resConfUnit1 = ResidualUnit(channels, rectified_skip)
-        self.resConfUnit2 = ResidualUnit(channels, rectified_skip)
+            self.resConfUnit1 = _ResidualUnit(channels, rectified_skip)
+        self.resConfUnit2 = _ResidualUnit(channels, rectified_skip)
         self.out_conv = nn.Conv2d(channels, channels, 1)
 
     def forward(self, coarse: Tensor, finer: Tensor | None, size: tuple[int, int]) -> Tensor:
@@ -55,7 +55,7 @@ def upsample(x: Tensor, size: tuple[int, int]) -> Tensor:
     return F.interpolate(x, size, mode="bilinear", align_corners=True)
 
 
-def output_layers(channels: int, out: int) -> nn.Sequential:
+def _output_layers(channels: int, out: int) -> nn.Sequential:
     """Returns the output layers: 3x3 convolution, ReLU, 1x1 convolution."""
     return nn.Sequential(nn.Conv2d(channels, HIDDEN, 3, padding=1), nn.ReLU(), nn.Conv2d(HIDDEN, out, 1))
 
@@ -69,7 +69,7 @@ class DPT(nn.Module):
         out_channels: channels of the four projected maps.
         out: channels of the output.
         patch_size: edge of a patch in pixels.
-        rectified_skip: see :class:`ResidualUnit`.
+        rectified_skip: see :class:`_ResidualUnit`.
         normalize: whether to apply a LayerNorm, shared by all taps, to the tokens first.
         position_weight: weight of the sine-cosine position embedding added to the maps; 0 adds none.
         sky: whether to predict sky as one more output channel, from the same fused map.
@@ -104,12 +104,12 @@ class DPT(nn.Module):
         self.scratch = nn.Module()
         for level, channels in enumerate((first, second, third, fourth), 1):
             self.scratch.add_module(f"layer{level}_rn", nn.Conv2d(channels, features, 3, padding=1, bias=False))
-            self.scratch.add_module(f"refinenet{level}", Fusion(features, rectified_skip, has_finer=level < 4))
+            self.scratch.add_module(f"refinenet{level}", _Fusion(features, rectified_skip, has_finer=level < 4))
         self.scratch.output_conv1 = nn.Conv2d(features, features // 2, 3, padding=1)
-        self.scratch.output_conv2 = output_layers(features // 2, out)
+        self.scratch.output_conv2 = _output_layers(features // 2, out)
         self.outputs = ("output_conv2", "sky_output_conv2") if sky else ("output_conv2",)
         if sky:
-            self.scratch.sky_output_conv2 = output_layers(features // 2, 1)
+            self.scratch.sky_output_conv2 = _output_layers(features // 2, 1)
 
     def fuse(self, tokens: Sequence[Tensor], grid: tuple[int, int]) -> Tensor:
         """Fuses four ``[N, P, D]`` token maps into ``[N, features / 2, H, W]``, before the output layers."""

@@ -46,7 +46,7 @@ TOLERANCE = 1e-3  # relative error; a correct graph differs by about 1e-6, a wro
 
 
 class Graph(nn.Module):
-    """Part of a backend as a function of tensors, for export: :func:`encode_tensors` or :func:`decode_tensors`."""
+    """Part of a backend as a function of tensors, for export: :func:`encode_tensors` or :func:`_decode_tensors`."""
 
     def __init__(self, backend: Exportable, function: Callable[..., tuple[Tensor, ...]]) -> None:
         super().__init__()
@@ -68,7 +68,7 @@ def encode_tensors(backend: Exportable, images: Tensor, *cameras: Tensor) -> tup
     return (*(tap.unflatten(2, tokens.grid) for tap in tokens.patch), tokens.camera)
 
 
-def decode_tensors(backend: Exportable, *tokens: Tensor) -> tuple[Tensor, ...]:
+def _decode_tensors(backend: Exportable, *tokens: Tensor) -> tuple[Tensor, ...]:
     """Decodes the results of :func:`encode_tensors`, all views at once, to depth, confidence, poses and intrinsics."""
     *patch, camera = tokens
     grid = (patch[0].shape[2], patch[0].shape[3])
@@ -121,7 +121,7 @@ def export(backend: Backend, out: Path) -> dict[str, Any]:
 
 def _export_graphs(backend: Exportable, folder: Path) -> dict[str, float]:
     """Writes both graphs; returns their largest :func:`relative_difference` to torch, at sizes not traced."""
-    encoder, decoder = (Graph(backend, function).eval() for function in (encode_tensors, decode_tensors))
+    encoder, decoder = (Graph(backend, function).eval() for function in (encode_tensors, _decode_tensors))
     tokens = token_names(len(backend.token_dims))
     names = ["images", "world_to_camera", "intrinsics"][: 3 if backend.needs_hints else 1]
     worst = {"encoder": 0.0, "decoder": 0.0}
@@ -133,9 +133,9 @@ def _export_graphs(backend: Exportable, folder: Path) -> dict[str, float]:
         for shape in CHECKED:
             inputs = example_inputs(backend, *shape)
             encoded = encoder(*inputs)
-            found = run_session(sessions[0], dict(zip(names, inputs, strict=True)), tokens)
+            found = _run_session(sessions[0], dict(zip(names, inputs, strict=True)), tokens)
             worst["encoder"] = max(worst["encoder"], *map(relative_difference, found, encoded))
-            found = run_session(sessions[1], dict(zip(tokens, encoded, strict=True)), DECODED)
+            found = _run_session(sessions[1], dict(zip(tokens, encoded, strict=True)), DECODED)
             worst["decoder"] = max(worst["decoder"], *map(relative_difference, found, decoder(*encoded)))
     if max(worst.values()) > TOLERANCE:
         raise RuntimeError(f"the exported graphs differ from torch: {worst}")
@@ -224,13 +224,13 @@ class OnnxBackend(Backend):
         if path is None:
             raise ValueError(f"backend=onnx needs backend.path=FOLDER: {REMEDY}")
         folder = Path(path).expanduser()
-        found = read_description(folder)
+        found = _read_description(folder)
         dims = tuple(found["token_dims"])
         super().__init__(found["name"], found["patch_size"], dims, found["licence"], needs_hints=found["needs_hints"])
         self._identity = {"name": found["name"], "weights": found["weights"]}
         self.head_chunk = head_chunk
         self.encoder_session = open_session(folder / ENCODER)
-        self.decoder = load_decoder(folder, found["decoder"])
+        self.decoder = _load_decoder(folder, found["decoder"])
         print(f"{self.name}: ONNX bundle {folder}, licence: {self.licence}")
         self.freeze()
 
@@ -243,7 +243,7 @@ class OnnxBackend(Backend):
             cameras = self.require_hints(images, hints, "cameras").cameras
             assert cameras is not None
             inputs |= {"world_to_camera": cameras.world_to_camera, "intrinsics": cameras.intrinsics}
-        *patch, camera = run_session(self.encoder_session, inputs, token_names(len(self.token_dims)))
+        *patch, camera = _run_session(self.encoder_session, inputs, token_names(len(self.token_dims)))
         return self.as_tokens(images, [tap.flatten(2, 3) for tap in patch], camera)
 
     def decode(self, tokens: Tokens) -> Geometry:
@@ -260,7 +260,7 @@ def token_names(taps: int) -> list[str]:
     return [*(f"patch_{index}" for index in range(taps)), "camera"]
 
 
-def read_description(folder: Path) -> dict[str, Any]:
+def _read_description(folder: Path) -> dict[str, Any]:
     """Reads ``backend.json`` of a bundle.
 
     Raises:
@@ -277,7 +277,7 @@ def read_description(folder: Path) -> dict[str, Any]:
     return content
 
 
-def load_decoder(folder: Path, decoder: Mapping[str, Any]) -> VGGTDecoder | DA3Decoder:
+def _load_decoder(folder: Path, decoder: Mapping[str, Any]) -> VGGTDecoder | DA3Decoder:
     """Rebuilds the decoder of a bundle from its ``class`` and ``arguments``.
 
     Raises:
@@ -311,7 +311,7 @@ def open_session(file: Path) -> onnxruntime.InferenceSession:
         raise ValueError(f"onnxruntime {onnxruntime.__version__} cannot open {file} ({error}): {REMEDY}") from error
 
 
-def run_session(
+def _run_session(
     session: onnxruntime.InferenceSession, inputs: Mapping[str, Tensor], outputs: Sequence[str]
 ) -> list[Tensor]:
     """Runs a session on tensors cast to float32; returns the named outputs on the inputs' device, without gradient."""

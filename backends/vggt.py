@@ -25,7 +25,7 @@ ITERATIONS = 4
 POSE_DIM = 9
 
 
-class CameraHead(nn.Module):
+class _CameraHead(nn.Module):
     """Decodes camera tokens of ``dim`` channels into pose encodings, iteratively, with a trunk of ``depth`` blocks."""
 
     def __init__(self, dim: int, depth: int, num_heads: int) -> None:
@@ -56,7 +56,7 @@ class CameraHead(nn.Module):
 REGISTERS = 4
 
 
-class Encoder(nn.Module):
+class _Encoder(nn.Module):
     """DINOv2 with registers; returns only patch tokens."""
 
     def __init__(self, dim: int, depth: int, num_heads: int, image_size: int, patch_size: int) -> None:
@@ -79,7 +79,7 @@ class Encoder(nn.Module):
         return self.norm(x)[:, 1 + REGISTERS :]
 
 
-class Aggregator(nn.Module):
+class _Aggregator(nn.Module):
     """Encoder, special tokens, and alternating within-view (frame) and across-view (global) blocks."""
 
     def __init__(
@@ -90,7 +90,7 @@ class Aggregator(nn.Module):
         self.head_dim = dim // num_heads
         self.camera_token = nn.Parameter(torch.zeros(1, 2, 1, dim).normal_(std=0.02))  # first view, other views
         self.register_token = nn.Parameter(torch.zeros(1, 2, REGISTERS, dim).normal_(std=0.02))
-        self.patch_embed = Encoder(dim, encoder_depth, num_heads, image_size, patch_size)
+        self.patch_embed = _Encoder(dim, encoder_depth, num_heads, image_size, patch_size)
         self.frame_blocks = nn.ModuleList(_alternating_block(dim, num_heads) for _ in range(depth))
         self.global_blocks = nn.ModuleList(_alternating_block(dim, num_heads) for _ in range(depth))
 
@@ -153,7 +153,7 @@ class VGGTDecoder(nn.Module):
         sizes = {"token_dim": token_dim, "features": features, "patch_size": patch_size}
         sizes |= {"camera_depth": camera_depth, "camera_heads": camera_heads}
         self.arguments: dict[str, Any] = {**sizes, "out_channels": list(out_channels)}
-        self.camera_head = CameraHead(token_dim, camera_depth, camera_heads)
+        self.camera_head = _CameraHead(token_dim, camera_depth, camera_heads)
         self.depth_head = DPT(token_dim, features, out_channels, 2, patch_size, rectified_skip=True)
 
     def decode(self, tokens: Tokens, chunk: int | None) -> Geometry:
@@ -167,11 +167,11 @@ class VGGTDecoder(nn.Module):
         return Cameras(world_to_camera, intrinsics, tokens.size)
 
 
-class VGGTNetwork(VGGTDecoder):
+class _VGGTNetwork(VGGTDecoder):
     """Aggregator (images to tokens) and decoder; names and shapes as published."""
 
     def __init__(
-        self, aggregator: Aggregator, features: int, out_channels: Sequence[int], camera_depth: int, camera_heads: int
+        self, aggregator: _Aggregator, features: int, out_channels: Sequence[int], camera_depth: int, camera_heads: int
     ) -> None:
         token_dim = 2 * aggregator.camera_token.shape[-1]
         super().__init__(token_dim, features, out_channels, aggregator.patch_size, camera_depth, camera_heads)
@@ -189,7 +189,7 @@ class VGGTBackend(NetworkBackend):
     """
 
     camera_name = "camera_head"
-    network: VGGTNetwork
+    network: _VGGTNetwork
 
     def __init__(
         self,
@@ -214,9 +214,9 @@ class VGGTBackend(NetworkBackend):
         head_chunk: int | None = 8,
         freeze: bool = True,
     ) -> None:
-        def make() -> VGGTNetwork:
-            aggregator = Aggregator(dim, depth, encoder_depth, num_heads, image_size, patch_size)
-            network = VGGTNetwork(aggregator, features, out_channels, camera_depth, camera_heads)
+        def make() -> _VGGTNetwork:
+            aggregator = _Aggregator(dim, depth, encoder_depth, num_heads, image_size, patch_size)
+            network = _VGGTNetwork(aggregator, features, out_channels, camera_depth, camera_heads)
             # iterations add up to about the identity pose and fields of view of 1 rad
             predict(network.camera_head.pose_branch.fc2, [value / ITERATIONS for value in (0, 0, 0, 0, 0, 0, 1, 1, 1)])
             return network

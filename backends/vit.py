@@ -49,7 +49,7 @@ class ViTMLP(nn.Module):
         return self.fc2(F.gelu(self.fc1(x)))
 
 
-class SwiGLU(nn.Module):
+class _SwiGLU(nn.Module):
     """Gated feed-forward layer; its hidden width is two thirds of ``hidden``, rounded up to a multiple of 8."""
 
     def __init__(self, dim: int, hidden: int) -> None:
@@ -64,7 +64,7 @@ class SwiGLU(nn.Module):
         return self.w3(F.silu(gate) * value)
 
 
-class LayerScale(nn.Module):
+class _LayerScale(nn.Module):
     """Learned scale per channel."""
 
     def __init__(self, dim: int, value: float) -> None:
@@ -103,12 +103,12 @@ class ViTBlock(nn.Module):
         super().__init__()
         self.norm1 = nn.LayerNorm(dim, eps=eps)
         self.attn = Attention(dim, num_heads, qk_norm)
-        self.ls1 = LayerScale(dim, layer_scale)
+        self.ls1 = _LayerScale(dim, layer_scale)
         self.norm2 = nn.LayerNorm(dim, eps=eps)
         if ffn not in get_args(FeedForward):
             raise ValueError(f"backend.ffn is {ffn!r}; choose one of {', '.join(get_args(FeedForward))}")
-        self.mlp = SwiGLU(dim, 4 * dim) if ffn == "swiglu" else ViTMLP(dim, 4 * dim)
-        self.ls2 = LayerScale(dim, layer_scale)
+        self.mlp = _SwiGLU(dim, 4 * dim) if ffn == "swiglu" else ViTMLP(dim, 4 * dim)
+        self.ls2 = _LayerScale(dim, layer_scale)
 
     def forward(self, x: Tensor, rotary: Rotary | None = None) -> Tensor:
         """Maps ``[B, N, dim]`` to ``[B, N, dim]``."""

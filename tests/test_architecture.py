@@ -6,7 +6,7 @@ import sys
 from graphlib import TopologicalSorter
 from pathlib import Path
 
-from tests.commands import FRESH, ROOT, run_python
+from tests.commands import ROOT
 
 # What a package of vg2gt may import in addition to itself and the leaves, which import no other package.
 LEAVES = {"types", "config", "memory", "profiling"}
@@ -151,14 +151,3 @@ import vg2gt.reconstruction.scene, vg2gt.outputs.outputs
 assert "lightning" not in sys.modules
 """
     subprocess.run([sys.executable, "-c", code], check=True)
-
-
-def test_training_imports_little_of_the_project(tmp_path: Path) -> None:
-    """Someone who changes the training has this much to read at most: no reader of data, no format."""
-    code = """
-import vg2gt.training.module
-ours = [name for name in sys.modules if name.split(".")[0] in ("vg2gt", "backends")]
-assert len(ours) <= 120, len(ours)
-"""
-    result = run_python(FRESH + code, folder=tmp_path)
-    assert result.returncode == 0, result.stderr

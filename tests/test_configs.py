@@ -113,7 +113,7 @@ def test_refinements_instantiate_and_the_default_is_the_codes(name: str) -> None
     assert (instantiate(config) == RefineOptions()) == (name == "default")
 
 
-@pytest.mark.parametrize("group", ["experiment", "ablation", "debug"])
+@pytest.mark.parametrize("group", ["experiment", "ablation"])
 def test_every_preset_composes(tmp_path: Path, group: str) -> None:
     assert group_options(group)
     for name in group_options(group):
@@ -170,6 +170,57 @@ def test_every_ablation_builds_what_it_says(tmp_path: Path, ablation: str) -> No
         "wo_enhance": loss.enhance.weight == 0,
     }
     assert {name for name, changed in full.items() if changed} == {ablation}
+
+
+# Constructor arguments that no configuration file sets: nobody should turn them, but results depend on their defaults.
+DEFAULTS: dict[str, dict[str, Any]] = {
+    "vg2gt.model.SceneScale": {"median_depth": 1.0},
+    "vg2gt.visibility.ViewCheck": {
+        "rounds": 2, "partners": 24, "fine_below": 1.4, "coarsest": 2.0, "moved_margin": 0.08,
+    },
+    "vg2gt.method.CoarseModule": {"neighbors": 16, "inject": "all", "upsample": 2},
+    "vg2gt.method.PTv3": {"window": 64, "norm": "layer", "legacy": False},
+    "vg2gt.method.FineModule": {"coarsest_drawn": 1.0},
+    "vg2gt.method.DenseHead": {"views_per_chunk": 8},
+    "vg2gt.method.PointMLP": {"stages": 2, "window": 32},
+    "vg2gt.method.GaussianHead": {"max_offset": 1.0},
+    "vg2gt.baselines.PixelHead": {"max_offset": 1.0, "max_depth_residual": 0.1},
+    "vg2gt.rendering.Renderer": {
+        "lowpass": 0.3, "alpha_max": 0.99, "slope_floor": 30.0, "bisections": 12, "newton_steps": 2, "geometry": True,
+    },
+    "vg2gt.losses.GeometryLoss": {"depth": 1.0, "point": 1.0, "gamma": 1.0, "alpha": 0.2, "quantile": 0.98},
+    "vg2gt.losses.EnhancementLoss": {"margin": 0.0, "form": "improve", "on": "total"},
+    "vg2gt.losses.GaussianLoss": {"confidence_weighted": True, "min_alpha": 0.5},
+    "vg2gt.refinement.FullSizeOptions": {
+        "renderings": 40.0, "coarse": 0.5, "rate": 0.5, "least": 0.3, "grow_every": 150, "grow_until": 0.4,
+        "opened": 0.7, "geometry_every": 8,
+    },
+    "vg2gt.data.RGBDFolder": {"invalid": (0, 65535)},
+    "vg2gt.data.sources.Infinigen": {"max_depth": 30.0},
+    "vg2gt.data.views.drawn.ViewSelection": {"index": None, "seed": 0},
+    "vg2gt.evaluation.evaluator.EvaluationOptions": {"neighbors": 8},
+    "vg2gt.evaluation.evaluator.PointOptions": {"cap": None},
+    "vg2gt.training.memory.ReturnFreeMemory": {"growth_mb": 600},
+    "backends.oracle.OracleBackend": {"patch_size": 14, "dim": 64, "response": 0.02},
+    "backends.da3.DA3Backend": {
+        "ffn": "mlp", "camera_depth": 4, "camera_heads": 16, "image_size": 518, "patch_size": 14, "revision": None,
+        "prefix": "model.", "seed": 0,
+    },
+    "backends.da3.DA3MetricBackend": {
+        "image_size": 518, "patch_size": 14, "revision": None, "prefix": "model.", "seed": 0,
+    },
+    "backends.vggt.VGGTBackend": {
+        "dim": 1024, "depth": 24, "encoder_depth": 24, "num_heads": 16, "features": 256,
+        "out_channels": (256, 512, 1024, 1024), "camera_depth": 4, "camera_heads": 16, "image_size": 518,
+        "patch_size": 14, "repo": "facebook/VGGT-1B", "revision": None, "seed": 0,
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("target", DEFAULTS)
+def test_what_no_file_sets_keeps_its_default(target: str) -> None:
+    parameters = inspect.signature(get_class(target)).parameters
+    assert {name: parameters[name].default for name in DEFAULTS[target]} == DEFAULTS[target]
 
 
 # What the paper does not have:

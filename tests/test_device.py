@@ -162,9 +162,9 @@ def test_a_reconstruction(device: str, as_on_a_gpu: Any) -> None:
 
 @slowly_on_a_cpu
 def test_a_run_from_beginning_to_end(device: str, tmp_path: Path, cache: Path, as_on_a_gpu: Any) -> None:
-    """``train.py debug=fast_dev_run``; its first render, in which the kernels are checked, is an evaluation's."""
+    """``train.py trainer.fast_dev_run=true``; the kernels are checked in its first render, an evaluation."""
     accelerator = "gpu" if device == "cuda" else "cpu"
-    options = [*sized(device), "debug=fast_dev_run", f"trainer.accelerator={accelerator}"]
+    options = [*sized(device), "trainer.fast_dev_run=true", f"trainer.accelerator={accelerator}"]
     if device == "cpu":
         as_on_a_gpu()
     else:

@@ -156,12 +156,6 @@ def test_every_figure_is_shown() -> None:
         assert f"figures/{figure.name}" in shown, figure.name
 
 
-def test_readme_and_docs_are_short() -> None:
-    assert len((ROOT / "README.md").read_text().splitlines()) <= 120
-    words = (word for page in DOCS for word in page.read_text().split() if re.search(r"\w", word))  # no bars of tables
-    assert sum(1 for _ in words) <= 15_000
-
-
 def rows(path: Path) -> set[tuple[str, ...]]:
     lines = [line for line in path.read_text().splitlines() if line.startswith("|")]
     return {tuple(cell.strip() for cell in line.strip("|").split("|")) for line in lines}

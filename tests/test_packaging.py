@@ -41,7 +41,7 @@ def test_installed_wheel_trains_from_an_empty_folder(tmp_path: Path, cache: Path
     # -S and an explicit path keep the checkout's editable install out.
     paths = [str(site), *(path for path in sys.path if path.endswith("site-packages"))]
     rooms = cache if renderer == "dense" else tmp_path / "rooms"
-    small = ["debug=fast_dev_run", "data.image_size=[28,56]", "data.train_scenes=1", "data.eval_scenes=1"]
+    small = ["trainer.fast_dev_run=true", "data.image_size=[28,56]", "data.train_scenes=1", "data.eval_scenes=1"]
     small += [f"renderer.implementation={renderer}", f"data.cache_dir={rooms}"]
     if renderer == "dense":
         data = build(small_config(tmp_path / "here", rooms, *small)).datamodule
@@ -82,7 +82,7 @@ def test_the_lowest_versions_do(tmp_path: Path) -> None:
     assert installed.returncode == 0, installed.stderr[-3000:]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "VG2GT_CACHE": str(tmp_path / "cache")}
     tests = ["tests/io", "tests/geometry", "tests/runs", "tests/test_configs.py", "tests/safety/test_archives.py"]
-    small = ["debug=fast_dev_run", "data.image_size=[56,112]", "data.train_scenes=1", "data.eval_scenes=1"]
+    small = ["trainer.fast_dev_run=true", "data.image_size=[56,112]", "data.train_scenes=1", "data.eval_scenes=1"]
     suite, training = ["-m", "pytest", "-q", "-p", "no:cacheprovider", *tests], [str(ROOT / "train.py"), *small]
     for command, folder in ((suite, ROOT), (training, tmp_path)):
         ran = subprocess.run(

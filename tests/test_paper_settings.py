@@ -10,6 +10,7 @@ import yaml
 from omegaconf import OmegaConf
 
 from tests.commands import ROOT
+from tests.test_configs import DEFAULTS
 from vg2gt.config import compose
 
 PAPER = ROOT.parent / "shared" / "paper" / "vg2gt.tex"
@@ -70,10 +71,11 @@ BOOKKEEPING = (
 
 
 def _settings() -> dict[str, Any]:
+    """Keys of the files, and the defaults of those that no file sets."""
     config: Any = OmegaConf.to_container(compose("train", "experiment=paper"))
 
     def walk(branch: dict[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
-        for key, value in branch.items():
+        for key, value in (DEFAULTS.get(branch.get("_target_", ""), {}) | branch).items():
             if isinstance(value, dict):
                 yield from walk(value, f"{path}{key}.")
             elif key not in ("_target_", "_partial_"):

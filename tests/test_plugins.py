@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.commands import FRESH, ROOT, run_python
-from vg2gt.runs.trust import UntrustedError, check_targets
+from vg2gt.runs.untrusted import UntrustedError, check_targets
 
 CODE = """
 sys.path.insert(0, sys.argv.pop(1))
@@ -57,7 +57,7 @@ def test_a_package_adds_a_backend_and_a_data_set(site: Path, tmp_path: Path) -> 
 
 
 def test_what_a_package_declares_is_trusted_and_nothing_else_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vg2gt.runs.trust.plugin_targets", lambda: {"backend": {"b": "some_pkg.B"}, "data": {}})
+    monkeypatch.setattr("vg2gt.runs.untrusted.plugin_targets", lambda: {"backend": {"b": "some_pkg.B"}, "data": {}})
     check_targets({"_target_": "some_pkg.B"}, "config.yaml: backend")
     with pytest.raises(UntrustedError, match=r"some_pkg\.system"):
         check_targets({"_target_": "some_pkg.system"}, "config.yaml: backend")

@@ -40,7 +40,6 @@ class Pipeline(LoadedModel):
         poses: Poses = "auto",
         window: int | None = None,
         folder: str | Path | None = None,
-        keep_windows: bool = False,
         monitor: Monitor | None = None,
     ) -> Scene:
         """Turns images into a scene, as ``vg2gt reconstruct`` does.
@@ -58,7 +57,6 @@ class Pipeline(LoadedModel):
             window: number of images that are processed at a time; 0: all at once; None: 24 if there are more than 100.
             folder: where cameras from structure from motion and finished windows are kept, so that the next call
                 reuses them; None: nowhere.
-            keep_windows: process in windows in any case, as ``vg2gt reconstruct --add`` needs it.
             monitor: shows and times the stages; None: progress bars if the standard error stream is a terminal.
 
         Returns:
@@ -86,7 +84,6 @@ class Pipeline(LoadedModel):
                 sfm_folder=kept and kept / SFM,
                 window=window,
                 window_folder=kept and kept / WINDOWS,
-                keep_windows=keep_windows,
                 calibration=self.calibration,
             )
             return refined(scene, refine, quality, overrides, monitor)

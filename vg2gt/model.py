@@ -26,6 +26,8 @@ from backends.cache import TokenCache
 from vg2gt.geometry.alignment import fit_depth_scale
 from vg2gt.geometry.cameras import focal_lengths, relative_to_first, scale_translations
 from vg2gt.memory import note_sizes
+from vg2gt.method.fine import FineModule
+from vg2gt.method.pooled import PooledVoxels
 from vg2gt.profiling import stage
 from vg2gt.types import Cameras, Decoded, Gaussians, Geometry, Hints, Prediction, Tokens, Voxels, check_choice
 from vg2gt.visibility import Support, ViewCheck
@@ -186,18 +188,17 @@ class Reconstructor(nn.Module, ABC):
         with stage("visibility"):
             return self.visibility(geometry, None if hints is None else hints.frame_ids)
 
-    def with_background(self, gaussians: Gaussians, images: Tensor, depth: Tensor) -> Gaussians:
+    def with_background(self, gaussians: Gaussians, sums: tuple[Tensor, Tensor]) -> Gaussians:
         """Sets the background to the mean colour of pixels without depth (the sky), else of all, unless it is black.
 
         Args:
             gaussians: Gaussians of B scenes.
-            images: ``[B, V, 3, H, W]`` input images.
-            depth: ``[B, V, H, W]`` the backbone's depth, 0 = invalid.
+            sums: result of :func:`background_sums`, or sums of several.
         """
         if self.background == "black":
             return gaussians
-        total, weight = background_sums(images, depth)
-        return replace(gaussians, background=total / weight)
+        total, weight = sums
+        return replace(gaussians, background=(total / weight).to(gaussians.means.device))
 
     def trained_parameters(self) -> list[nn.Parameter]:
         """Returns the trainable parameters: all but those of a frozen backbone."""
@@ -266,7 +267,7 @@ class VG2GT(Reconstructor):
         backend: Backend,
         scale: SceneScale,
         coarse: Callable[..., nn.Module] | None,
-        fine: Callable[..., nn.Module],
+        fine: Callable[..., FineModule],
         gaussians: Callable[..., nn.Module],
         keep_scale: bool = True,
         background: Background = "black",
@@ -288,13 +289,28 @@ class VG2GT(Reconstructor):
         # ours: mask of pixels that other views do not contradict [B, V, H, W]
         support = self.support(decoded.geometry, hints)
         keep, coarsen = (None, None) if support is None else (support.keep, support.coarsen)
-        # fine level: pixels to M voxels with features [M, C]
+        # fine level: pixels to M voxels
+        geometry = decoded.geometry.where(keep)
         with stage("fine"):
-            voxels: Voxels = self.fine(tokens, decoded.geometry.where(keep), images, coarsen)
+            size = self.fine.voxel_edges(geometry, coarsen)
+            pooled = self.fine.pool(tokens, geometry, images, size)
+        voxels, gaussians = self.finish(pooled, size, background_sums(images, decoded.initial.depth))
+        return Prediction(decoded.initial, decoded.geometry, decoded.unit, voxels, gaussians, keep)
+
+    def finish(self, pooled: PooledVoxels, size: Tensor, background: tuple[Tensor, Tensor]) -> tuple[Voxels, Gaussians]:
+        """Turns the pooled voxels of B whole scenes into Gaussians; those of a long capture are merged before.
+
+        Args:
+            pooled: M voxels (:meth:`vg2gt.method.fine.FineModule.pool`).
+            size: ``[B]`` their edges in scene units.
+            background: :func:`background_sums` of all views.
+        """
+        # voxels with features [M, C]
+        with stage("fine"):
+            voxels = self.fine.refine(pooled, size)
         # every voxel splits into K Gaussians: [M * K]
         with stage("gaussians"):
-            gaussians = self.with_background(self.gaussians(voxels), images, decoded.initial.depth)
-        return Prediction(decoded.initial, decoded.geometry, decoded.unit, voxels, gaussians, keep)
+            return voxels, self.with_background(self.gaussians(voxels), background)
 
     def enhance(
         self,

@@ -87,7 +87,7 @@ class Backbone(nn.Module):
         for index, block in enumerate(self.blocks):
             # move the reference view to the front, just before the multi-view blocks
             if choose and index == self.multiview_from - 1:
-                order = reference_first(select_reference(x[:, :, 0]), views)
+                order = _reference_first(_select_reference(x[:, :, 0]), views)
                 x = _take_views(x, order)
                 local = _take_views(local, order)
             if index == self.multiview_from:
@@ -128,7 +128,7 @@ class Backbone(nn.Module):
         return patch, torch.cat((local[:, :, 0], x[:, :, 0]), -1)
 
 
-def select_reference(tokens: Tensor) -> Tensor:
+def _select_reference(tokens: Tensor) -> Tensor:
     """Chooses the reference view of each scene as ``saddle_balanced`` does.
 
     Scales three measures to [0, 1] over the views, and chooses the view closest to 0.5 in all of them: mean cosine
@@ -152,7 +152,7 @@ def select_reference(tokens: Tensor) -> Tensor:
     return torch.where(enough, (scaled - 0.5).abs().sum(0).argmin(-1), 0)
 
 
-def reference_first(reference: Tensor, views: int) -> Tensor:
+def _reference_first(reference: Tensor, views: int) -> Tensor:
     """Returns the order ``[B, V]`` of the views that moves the reference ``[B]`` to the front."""
     index = torch.arange(views, device=reference.device)
     chosen = reference[:, None]

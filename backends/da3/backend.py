@@ -21,7 +21,7 @@ POSE_DIM = 9
 MIN_MEDIAN_DISTANCE = 0.1
 
 
-class CameraDecoder(nn.Module):
+class _CameraDecoder(nn.Module):
     """Decodes a camera token ``[B, V, D]`` into a pose encoding ``[B, V, 9]``, without iterations."""
 
     def __init__(self, dim: int) -> None:
@@ -37,7 +37,7 @@ class CameraDecoder(nn.Module):
         return torch.cat((self.fc_t(features), self.fc_qvec(features), self.fc_fov(features)), -1)
 
 
-class CameraEncoder(nn.Module):
+class _CameraEncoder(nn.Module):
     """Encodes known cameras as camera tokens ``[B, V, C]``."""
 
     def __init__(self, dim: int, depth: int, num_heads: int) -> None:
@@ -80,7 +80,7 @@ class DA3Decoder(nn.Module):
         sizes = {"token_dim": token_dim, "features": features, "patch_size": patch_size}
         self.arguments: dict[str, Any] = {**sizes, "out_channels": list(out_channels)}
         self.head = DPT(token_dim, features, out_channels, 2, patch_size)
-        self.cam_dec = CameraDecoder(token_dim)
+        self.cam_dec = _CameraDecoder(token_dim)
 
     def decode(self, tokens: Tokens, chunk: int | None) -> Geometry:
         """See :meth:`Backend.decode`; the depth head runs on at most ``chunk`` views at a time."""
@@ -93,11 +93,11 @@ class DA3Decoder(nn.Module):
         return Cameras(invert_rigid(camera_to_world), intrinsics, tokens.size)
 
 
-class DA3Network(DA3Decoder):
+class _DA3Network(DA3Decoder):
     """Backbone, decoder and, unless None, camera encoder; names as published."""
 
     def __init__(
-        self, backbone: Backbone, cam_enc: CameraEncoder | None, features: int, out_channels: Sequence[int]
+        self, backbone: Backbone, cam_enc: _CameraEncoder | None, features: int, out_channels: Sequence[int]
     ) -> None:
         token_dim = 2 * backbone.cls_token.shape[-1]
         super().__init__(token_dim, features, out_channels, backbone.patch_size)
@@ -122,7 +122,7 @@ class DA3Backend(NetworkBackend):
     """
 
     camera_name = "cam_dec"
-    network: DA3Network
+    network: _DA3Network
 
     def __init__(
         self,
@@ -155,10 +155,10 @@ class DA3Backend(NetworkBackend):
             known = ", ".join(get_args(ReferenceView))
             raise ValueError(f"backend.reference_view is {reference_view!r}; choose one of {known}")
 
-        def make() -> DA3Network:
-            network = DA3Network(
+        def make() -> _DA3Network:
+            network = _DA3Network(
                 Backbone(dim, depth, num_heads, ffn, multiview_from, image_size, patch_size),
-                CameraEncoder(dim, camera_depth, camera_heads) if given_poses else None,
+                _CameraEncoder(dim, camera_depth, camera_heads) if given_poses else None,
                 features,
                 out_channels,
             )

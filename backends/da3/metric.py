@@ -108,7 +108,7 @@ def fill_sky(depth: Tensor, sky: Tensor) -> Tensor:
         depth: ``[B, V, H, W]``.
         sky: sky score ``[B, V, H, W]``; sky from 0.3 on.
     """
-    far, is_sky = far_ends(depth, sky)[:, None, None, None], sky >= SKY_THRESHOLD
+    far, is_sky = _far_ends(depth, sky)[:, None, None, None], sky >= SKY_THRESHOLD
     enough = is_sky.sum((1, 2, 3), keepdim=True) > MIN_PIXELS
     return torch.where(is_sky & enough & far.isfinite(), far, depth)
 
@@ -148,7 +148,7 @@ class DA3NestedBackend(Backend):
         metric_tokens = self.metric.encode(images, Hints(cameras=geometry.cameras))
         depth, sky = self.metric.decode_raw(metric_tokens)
         scale = fit_scale(depth * metres(geometry.cameras)[..., None, None], sky, geometry)
-        far = torch.minimum(far_ends(geometry.depth, sky), FARTHEST_SKY / scale)
+        far = torch.minimum(_far_ends(geometry.depth, sky), FARTHEST_SKY / scale)
         return replace(tokens, state={**tokens.state, "scale": scale, "sky": sky >= SKY_THRESHOLD, "far": far})
 
     def decode(self, tokens: Tokens) -> Geometry:
@@ -173,7 +173,7 @@ class DA3NestedBackend(Backend):
         return self.relative.predict_cameras(images, hints)
 
 
-def far_ends(depth: Tensor, sky: Tensor) -> Tensor:
+def _far_ends(depth: Tensor, sky: Tensor) -> Tensor:
     """Returns the far end of each scene, ``[B]``: the 0.99 quantile of the pixels that are not sky.
 
     It is NaN for a scene with at most ten such pixels. Arguments as of :func:`fill_sky`.

@@ -30,7 +30,7 @@ class Features(NamedTuple):
     context_fine: Tensor
 
 
-class InstanceNorm(nn.Module):
+class _InstanceNorm(nn.Module):
     """Instance normalisation from elementary operations; torch's is slow on channels-last CPU tensors."""
 
     def __init__(self, channels: int) -> None:
@@ -49,7 +49,7 @@ class InstanceNorm(nn.Module):
 def conv_norm(inputs: int, outputs: int, stride: int = 1, kernel: int = 3, relu: bool = True) -> nn.Sequential:
     """Returns convolution, instance normalisation and, with ``relu``, ReLU."""
     conv = nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2, bias=False)
-    return nn.Sequential(conv, InstanceNorm(outputs), *([nn.ReLU(inplace=True)] if relu else []))
+    return nn.Sequential(conv, _InstanceNorm(outputs), *([nn.ReLU(inplace=True)] if relu else []))
 
 
 def upsample(x: Tensor, like: Tensor) -> Tensor:
@@ -57,7 +57,7 @@ def upsample(x: Tensor, like: Tensor) -> Tensor:
     return F.interpolate(x, size=like.shape[-2:], mode="bilinear", align_corners=False)
 
 
-class ResidualBlock(nn.Module):
+class _ResidualBlock(nn.Module):
     """Residual block of two 3x3 convolutions."""
 
     def __init__(self, channels: int) -> None:
@@ -76,9 +76,9 @@ class FeaturePyramid(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.to_half = nn.Sequential(conv_norm(3, 32, 2, 5), conv_norm(32, 32))
-        self.to_quarter = nn.Sequential(conv_norm(32, 48, 2), ResidualBlock(48), ResidualBlock(48))
-        self.to_eighth = nn.Sequential(conv_norm(48, 64, 2), ResidualBlock(64), ResidualBlock(64))
-        self.to_sixteenth = nn.Sequential(conv_norm(64, 96, 2), ResidualBlock(96))
+        self.to_quarter = nn.Sequential(conv_norm(32, 48, 2), _ResidualBlock(48), _ResidualBlock(48))
+        self.to_eighth = nn.Sequential(conv_norm(48, 64, 2), _ResidualBlock(64), _ResidualBlock(64))
+        self.to_sixteenth = nn.Sequential(conv_norm(64, 96, 2), _ResidualBlock(96))
         self.from_sixteenth = nn.Conv2d(96, 64, 1)
         self.from_eighth = nn.Conv2d(64, 48, 1)
         self.from_quarter = nn.Conv2d(48, 32, 1)

@@ -80,7 +80,7 @@ class PlaneSweep(nn.Module):
         return mean_similarity(similarity, weight, size)
 
 
-class PlaneBlock(nn.Module):
+class _PlaneBlock(nn.Module):
     """Residual block on a volume: 3x3 in the image, then 5 along the planes, as 2D convolutions (3D ones are slow)."""
 
     def __init__(self, channels: int) -> None:
@@ -103,11 +103,11 @@ class VolumeNet(nn.Module):
     def __init__(self, channels: int = 16) -> None:
         super().__init__()
         self.begin = nn.Conv2d(GROUPS + 1, channels, 3, 1, 1)
-        self.first = PlaneBlock(channels)
+        self.first = _PlaneBlock(channels)
         self.down = nn.Conv2d(channels, 2 * channels, 2, 2)
-        self.coarse = nn.ModuleList(PlaneBlock(2 * channels) for _ in range(2))
+        self.coarse = nn.ModuleList(_PlaneBlock(2 * channels) for _ in range(2))
         self.up = nn.Conv2d(2 * channels, channels, 1)
-        self.last = PlaneBlock(channels)
+        self.last = _PlaneBlock(channels)
         self.end = nn.Conv2d(channels, 1, 1)
         self.sharpness = nn.Parameter(torch.tensor(6.0))  # adds the similarity to the logits, also before training
 

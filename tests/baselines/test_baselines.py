@@ -55,7 +55,7 @@ def predict(model: Reconstructor, batch: Batch) -> Prediction:
 
 @pytest.mark.parametrize("name", TRAINED)
 def test_fast_dev_run(tmp_path: Path, cache: Path, name: str) -> None:
-    report = train(small_config(tmp_path, cache, "debug=fast_dev_run", f"model={name}"))
+    report = train(small_config(tmp_path, cache, "trainer.fast_dev_run=true", f"model={name}"))
     assert {"psnr", "abs_rel", "decoded_abs_rel"} <= set(report["trained"])
     assert all(value == value for value in report["trained"].values())
     assert report["trained"]["decoded_abs_rel"] == report["trained"]["decoded_abs_rel_before"]

@@ -55,7 +55,7 @@ def test_help_shows_an_example_and_of_a_training_every_group_and_imports_little(
     for words, command in ALL.items():
         assert command.example in helps[" ".join(words)]
         assert f"{command.example} ".startswith(f"vg2gt {' '.join(words)} ")
-    for group in ("ablation", "backend", "data", "debug", "experiment", "logger", "loss", "model", "renderer"):
+    for group in ("ablation", "backend", "data", "experiment", "logger", "loss", "model", "renderer"):
         assert f"\n{group}: " in helps["train"]
         assert f"\n{group}: " in helps["ablate"]
 

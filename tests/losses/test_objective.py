@@ -146,7 +146,7 @@ def test_term_weights_reach_the_total(sample) -> None:
     ("name", "weights"), [("paper", (1.0, 1.0, 1.0, 1.0, 1.0, 1.0)), ("release", (10.0, 0.9, 0.1, 0.25, 0.25, 0.001))]
 )
 def test_configurations_hold_the_published_weights(name: str, weights: tuple[float, ...]) -> None:
-    loss = instantiate(compose(f"loss/{name}", "loss.enhance.on=reg", "loss.align.source=rendered").loss)
+    loss = instantiate(compose(f"loss/{name}", "+loss.enhance.on=reg", "loss.align.source=rendered").loss)
     assert isinstance(loss, VG2GTLoss)
     g = loss.gaussian
     assert (g.weight, g.color_l1, g.ssim, g.depth_consistency, g.depth_gt, g.normal) == weights

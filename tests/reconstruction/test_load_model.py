@@ -52,12 +52,8 @@ def test_what_is_unknown_is_named(overrides: list[str], said: str) -> None:
 
 def test_a_slim_checkpoint_is_the_same_model(run_folder: Path, tmp_path: Path) -> None:
     """Weights without the optimiser, with their configuration: no run folder is needed."""
-    known = torch.load(run_folder / "checkpoints" / "step-7.ckpt", weights_only=True)
-    # as a former version wrote it
-    known["config"] = known["config"].replace("depth_noise:", "drift: 0.0\n  depth_noise:")
-    assert "drift" in known["config"]
-    torch.save(known, tmp_path / "whole.ckpt")
-    slim = write_slim(tmp_path / "whole.ckpt", tmp_path / "weights.safetensors")
+    whole_file = run_folder / "checkpoints" / "step-7.ckpt"
+    slim = write_slim(whole_file, tmp_path / "weights.safetensors")
     whole, loaded = load_model(run_folder, device="cpu"), load_model(slim, device="cpu")
     state = loaded.model.trained_state()
     assert all(torch.equal(state[name], value) for name, value in whole.model.trained_state().items())
@@ -68,7 +64,7 @@ def test_a_slim_checkpoint_is_the_same_model(run_folder: Path, tmp_path: Path) -
     with pytest.raises(ValueError, match=r"weights\.safetensors is damaged"):
         load_model(slim, device="cpu")
     with pytest.raises(ValueError, match="must end with"):
-        write_slim(tmp_path / "whole.ckpt", tmp_path / "weights.ckpt")
+        write_slim(whole_file, tmp_path / "weights.ckpt")
 
 
 def test_what_ships_needs_no_name() -> None:
@@ -128,7 +124,7 @@ def test_weights_of_a_diverged_training_are_refused(run_folder: Path, tmp_path: 
 
 
 def test_python_interface(run_folder: Path, recording: Path, tmp_path: Path) -> None:
-    model = vg2gt.load(run_folder, overrides=["renderer.alpha_max=0.9"], device="cpu")
+    model = vg2gt.load(run_folder, overrides=["+renderer.alpha_max=0.9"], device="cpu")
     scene = model.reconstruct(recording, size=56, max_images=2)
     assert scene.renderer.alpha_max == 0.9
     assert isinstance(scene, vg2gt.Scene)
@@ -200,6 +196,6 @@ def test_full_memory_names_the_knobs(error: Exception, ready, recording: Path, m
     def fail(*args, **kwargs):
         raise error
 
-    monkeypatch.setattr(ready.model.fine, "forward", fail)
+    monkeypatch.setattr(ready.model.fine, "pool", fail)
     with pytest.raises(OutOfMemory, match=r"4 images of 84x112.*--max-images.*--size.*head_chunk"):
         reconstruct_with(ready.model, recording)

@@ -108,10 +108,10 @@ def test_an_interrupted_run_goes_on(model, walk, whole, tmp_path, monkeypatch) -
     calls = model.backend._calls
     pool, pooled = model.fine.pool, []
 
-    def stop(*inputs):
+    def stop(*inputs, capped):
         if len(pooled) == 2:
             raise KeyboardInterrupt
-        pooled.append(pool(*inputs))
+        pooled.append(pool(*inputs, capped=capped))
         return pooled[-1]
 
     monkeypatch.setattr(model.fine, "pool", stop)
@@ -178,9 +178,9 @@ def test_windows_of_other_cameras_or_content_are_not_reused(model, walk, tmp_pat
     clip.write_bytes(b"1")
     others = [replace(first, pose=first.pose + 1), replace(first, intrinsics=2 * first.intrinsics)]
     others.append(replace(first, container=clip))
-    keys = {windows_run.set_key(model, [each, *pictures[1:]], (56, 84), 4) for each in (first, *others)}
+    keys = {store.set_key(model, [each, *pictures[1:]], (56, 84), 4) for each in (first, *others)}
     clip.write_bytes(b"12")
-    assert len(keys | {windows_run.set_key(model, [others[-1], *pictures[1:]], (56, 84), 4)}) == 5
+    assert len(keys | {store.set_key(model, [others[-1], *pictures[1:]], (56, 84), 4)}) == 5
 
 
 def test_windows_keep_map_coordinates(model, walk, tmp_path) -> None:

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -158,27 +157,3 @@ def obey_names(backend: Backend, monkeypatch: Any) -> None:
 
     monkeypatch.setattr(backend, "encode", told)
     monkeypatch.setattr(backend, "decode", seen)
-
-
-def random_mutation(rng: np.random.Generator) -> tuple[str, Mutation]:
-    """One to three mutations after another, and sometimes another unit, focal length or noise of random strength."""
-    names = rng.choice(list(SCENES), size=int(rng.integers(1, 4)), replace=False)
-    steps, strength = [SCENES[name] for name in names], float(10.0 ** rng.uniform(-8, 8))
-    noise = torch.Generator().manual_seed(int(rng.integers(1 << 31)))
-    extra = {
-        "noisy depth": _depth(lambda d: d * (torch.randn(d.shape, generator=noise) * min(strength, 10.0)).exp()),
-        "holes": _depth(lambda d: d * (torch.rand(d.shape, generator=noise) < min(strength, 0.5))),
-        "shaken": _posed(lambda p, _: p[..., :3, 3].add_(strength * torch.randn(p[..., 3, 1:].shape, generator=noise))),
-        "unit": _times(strength),
-        "focal length": _focal(strength),
-        "nothing": SCENES["unchanged"],
-    }
-    more = str(rng.choice(list(extra)))
-
-    def mutate(batch: Batch) -> Batch:
-        batch = batch.map(Tensor.clone)
-        for step in (*steps, extra[more]):
-            batch = step(batch)
-        return batch
-
-    return f"{' + '.join(names)} + {more} {strength:.1e}", mutate

@@ -3,12 +3,11 @@
 import math
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
 
-from tests.reliability.degenerate import SCENES, beside, obey_names, random_mutation
+from tests.reliability.degenerate import SCENES, beside, obey_names
 from tests.reliability.steps import first_batches, fit, tiny_run
 from vg2gt.evaluation.evaluator import EvaluationOptions, SceneEvaluator
 from vg2gt.evaluation.in_training import evaluate_scene
@@ -89,22 +88,6 @@ def spoil(module: nn.Module) -> None:
         for parameter in module.parameters():
             if parameter.requires_grad:
                 parameter.fill_(float("nan"))
-
-
-@pytest.mark.parametrize(("first_seed", "count"), [(0, 12), pytest.param(1000, 400, marks=pytest.mark.slow)])
-def test_mutated_scenes_do_no_harm(first_seed, count, tmp_path, cache, monkeypatch) -> None:
-    """Trains on random mutations in the order of their seeds, half of them batched with a good scene."""
-    run, good = make(FULL, tmp_path, cache, monkeypatch)
-    batches, labels = [], []
-    for seed in range(first_seed, first_seed + count):
-        label, mutate = random_mutation(np.random.default_rng(seed))
-        batches.append(beside(good, mutate(good)) if seed % 2 else mutate(good))
-        labels.append(f"{seed}: {label}")
-    audit = fit(run, batches)
-    harmed = [label for label, finite in zip(labels, audit.finite, strict=True) if not finite]
-    assert not harmed
-    audit.assert_sound()
-    print(f"{count} mutated scenes: {sum(audit.skipped)} dropped, none harmful")
 
 
 @pytest.mark.parametrize("overrides", [(), ("model=voxel_merged",)], ids=" ".join)

@@ -228,7 +228,8 @@ def test_voxel_grids_do_not_depend_on_the_precision(tmp_path: Path, cache: Path)
         tokens, geometry, _ = model.read_views(context.images, context.hints)
         for enabled in (False, True):
             with autocast(enabled):
-                found.append(model.fine(tokens, geometry, context.images))
+                size = model.fine.voxel_edges(geometry)
+                found.append(model.fine.refine(model.fine.pool(tokens, geometry, context.images, size), size))
     exact, mixed = found
     for name in ("grid", "batch", "count", "colors", "confidence", "centroid", "voxel_size"):
         assert torch.equal(getattr(exact, name), getattr(mixed, name)), name

@@ -22,7 +22,7 @@ from vg2gt.io.cameras_json import NamedCamera
 from vg2gt.io.image_files import image_size, read_color, read_depth
 from vg2gt.io.tensors import read_tensors
 from vg2gt.runs.checkpoints import read_checkpoint
-from vg2gt.runs.trust import read_run_config
+from vg2gt.runs.untrusted import read_run_config
 from vg2gt.viewer import load_pictures
 
 HUGE = 1 << 60

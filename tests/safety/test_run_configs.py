@@ -8,17 +8,15 @@ from typing import Any
 
 import pytest
 import torch
-from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from vg2gt.config import config_dir
 from vg2gt.evaluation.checks import refuse_training_views
 from vg2gt.runs.checkpoints import MADE_OF
 from vg2gt.runs.load import load_model
-from vg2gt.runs.trust import ENVIRONMENT, UntrustedError, check_targets, parse_run_config
+from vg2gt.runs.untrusted import ENVIRONMENT, UntrustedError, check_targets
 from vg2gt.studies.study import _refuse_other_run
 from vg2gt.training.start import name_differences
-from vg2gt.visibility import ViewCheck
 
 Attack = Callable[[str], dict[str, Any]]
 
@@ -135,14 +133,6 @@ def test_a_package_is_trusted_by_name(run_folder: Path, tmp_path: Path, monkeypa
     with pytest.raises(UntrustedError, match="not in my_own_pkg"):
         load_model(run_folder, device="cpu")
     monkeypatch.delitem(sys.modules, "my_own_pkg")
-
-
-def test_classes_of_former_versions_are_found_where_they_are_now() -> None:
-    config = parse_run_config(
-        "visibility: {_target_: vg2gt.method.additions.visibility.ViewCheck, margin: 0.05}", "run"
-    )
-    check_targets(config, "")
-    assert instantiate(config.visibility) == ViewCheck(margin=0.05)
 
 
 def test_everything_of_the_projects_configurations_is_trusted() -> None:

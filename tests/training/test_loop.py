@@ -32,7 +32,7 @@ VARIANTS += ["loss=release", "backend=vggt_tiny", "backend=da3_tiny"]
 
 @pytest.mark.parametrize("override", VARIANTS)
 def test_fast_dev_run(tmp_path: Path, cache: Path, override: str) -> None:
-    report = train(small_config(tmp_path, cache, "debug=fast_dev_run", override))
+    report = train(small_config(tmp_path, cache, "trainer.fast_dev_run=true", override))
     assert {"psnr", "abs_rel", "decoded_abs_rel"} <= set(report["trained"])
     assert all(value == value for value in report["trained"].values())
     if override == "ablation=wo_coarse":
@@ -47,7 +47,9 @@ def changed_by(run: Run, module: torch.nn.Module) -> set[str]:
 
 
 def test_onnx_backend_trains(tmp_path: Path, cache: Path, onnx_bundle: Path) -> None:
-    run = build(small_config(tmp_path, cache, "debug=fast_dev_run", "backend=onnx", f"backend.path={onnx_bundle}"))
+    run = build(
+        small_config(tmp_path, cache, "trainer.fast_dev_run=true", "backend=onnx", f"backend.path={onnx_bundle}")
+    )
     assert changed_by(run, full_model(run).coarse)
 
 
@@ -98,8 +100,8 @@ def everything_in(folder: Path) -> dict[Path, bytes]:
 
 
 REFUSED: list[tuple[list[str], str | None]] = [
-    (["debug=fast_dev_run", "model.gaussians.max_offset=3"], None),
-    (["debug=fast_dev_run", "ckpt=last", "backend.seed=1"], "trained on backbone"),
+    (["trainer.fast_dev_run=true", "+model.gaussians.max_offset=3"], None),
+    (["trainer.fast_dev_run=true", "ckpt=last", "backend.seed=1"], "trained on backbone"),
     (["ckpt=last", "backend.taps=1"], r"step-4\.ckpt was trained with backend\.taps=4, but this run uses 1"),
     (["ckpt=last", "model.gaussians.splits=4"], r"first mismatch: model\.gaussians\.out"),
     (["ckpt=last", "optimizer=adamw"], r"optimizer\._target_=torch\.optim\.AdamW differs from vg2gt\.training\.muon"),
@@ -114,7 +116,7 @@ REFUSED: list[tuple[list[str], str | None]] = [
             "optimizer.lr=-1": r"optimizer: Invalid learning rate: -1",
             "optimizer.lr=0": r"optimizer\.lr=0.*a positive number",
             "loss.geometry=null": r"loss\.geometry=null does not turn anything off",
-            "loss.geometry.quantile=0": "greater than 0 and at most 1",
+            "+loss.geometry.quantile=0": "greater than 0 and at most 1",
             "training.render_views=0": r"training\.render_views=0.*at least 1, or null for all",
             "+trainer.accumulate_grad_batches=2": "accumulate",
             "+trainer.gradient_clip_algorithm=value": "use norm",

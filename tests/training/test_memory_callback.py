@@ -58,7 +58,7 @@ def test_every_run_on_a_cpu_has_it(tmp_path: Path, cache: Path, monkeypatch: pyt
 
 def test_negative_growth_is_refused(tmp_path: Path, cache: Path) -> None:
     with pytest.raises(InstantiationException, match="growth_mb must not be negative"):
-        build(small_config(tmp_path, cache, "callbacks.memory.growth_mb=-1"))
+        build(small_config(tmp_path, cache, "+callbacks.memory.growth_mb=-1"))
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="torch asks for large pages on Linux only")

@@ -61,7 +61,7 @@ def test_all_is_trained_from_what_it_leaves(tmp_path: Path, cache: Path) -> None
     curve = curves.read_text().splitlines()[0].split(",")
     assert "train/depth_reg" in curve
     assert "train/color_l1" not in curve
-    options = ["debug=fast_dev_run", f"init_from={checkpoint}"]
+    options = ["trainer.fast_dev_run=true", f"init_from={checkpoint}"]
     assert train(small_config(tmp_path / "next", cache, *options))["trained"]
 
 

@@ -6,8 +6,7 @@ import torch
 from tests.voxels.conftest import room
 from vg2gt.visibility import ViewCheck
 from vg2gt.visibility import check as check_module
-from vg2gt.visibility.blocks import check_blocks, coarsening, neighbourhood
-from vg2gt.visibility.check import choose_partners
+from vg2gt.visibility.check import _neighbourhood, choose_partners
 
 
 @pytest.mark.parametrize("many", [100, 5])
@@ -22,16 +21,16 @@ def test_blocks_keep_the_same_pixels(many: int, monkeypatch) -> None:
     partners = choose_partners(depth[0], geometry.cameras, check.partners)
     masks = (torch.zeros_like(depth[0]), torch.zeros_like(depth[0]))
     blocks = [slice(0, 2), slice(2, 5), slice(5, 7)]
-    steps = list(check_blocks(check, depth[0], geometry.cameras, partners, blocks, masks))
+    steps = list(check.in_blocks(depth[0], geometry.cameras, partners, blocks, masks))
     assert len(steps) == check.rounds * len(blocks)
     assert torch.equal(masks[0] > 0, whole.keep[0])
     assert 0 < (masks[0] > 0).float().mean() < 1
-    assert torch.equal(coarsening(check, depth[0], geometry.cameras, partners), whole.coarsen)
+    assert torch.equal(check.coarsening(depth[0], geometry.cameras, partners), whole.coarsen[0])
 
 
 def test_a_neighbourhood_counts_partners_among_its_views() -> None:
     partners = torch.tensor([[1, 2], [0, -1], [3, 1], [2, 0]])
-    views, local = neighbourhood(partners, torch.tensor([2, 3]))
+    views, local = _neighbourhood(partners, torch.tensor([2, 3]))
     assert views.tolist() == [2, 3, 0, 1]
     assert local.tolist() == [[1, 3], [0, 2], [-1, -1], [-1, -1]]
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from vg2gt.geometry.cameras import invert_rigid, ray_directions
 from vg2gt.method import CoarseModule, DenseHead, FineModule, PointMLP, PTv3
-from vg2gt.types import Cameras, Geometry, Tokens
+from vg2gt.types import Cameras, Geometry, Tokens, Voxels
 
 PATCH = 14
 TOKEN_DIM = 24
@@ -86,6 +86,14 @@ def make_coarse() -> Callable[..., CoarseModule]:
     return make
 
 
+class WholeScenes(FineModule):
+    """Pools and refines, as :class:`vg2gt.model.VG2GT` does."""
+
+    def forward(self, tokens: Tokens, geometry: Geometry, images: Tensor, coarsen: Tensor | None = None) -> Voxels:
+        size = self.voxel_edges(geometry, coarsen)
+        return self.refine(self.pool(tokens, geometry, images, size), size)
+
+
 @pytest.fixture
 def make_fine() -> Callable[..., FineModule]:
     def make(**options) -> FineModule:
@@ -96,7 +104,7 @@ def make_fine() -> Callable[..., FineModule]:
             "voxel_size": 0.125,
             "min_footprint": 0.0,
         }
-        return FineModule([TOKEN_DIM] * TAPS, PATCH, **{**defaults, **options})
+        return WholeScenes([TOKEN_DIM] * TAPS, PATCH, **{**defaults, **options})
 
     return make
 

@@ -170,10 +170,8 @@ def test_compiled_moments_equal_the_reference():
     inputs = [values, depth, confidence, views + 0.5, pool_mean(values, confidence, plan)]
     compiled = pool_point_moments(*inputs, plan, views_per_chunk=2)
     reference = pool_point_moments(*(tensor.double() for tensor in inputs), plan, views_per_chunk=2)
-    for found, expected in zip(compiled, reference, strict=True):
-        assert found.dtype == torch.float32
-        assert expected.dtype == torch.float64
-        torch.testing.assert_close(found.double(), expected, atol=1e-6, rtol=1e-5)
+    assert (compiled.dtype, reference.dtype) == (torch.float32, torch.float64)
+    torch.testing.assert_close(compiled.double(), reference, atol=1e-6, rtol=1e-5)
 
 
 def test_fringes_of_silhouettes_make_no_voxels(make_fine, make_room):

@@ -11,13 +11,13 @@ from vg2gt.method.pooled import merge
 
 
 @pytest.mark.parametrize("moments", [False, True])
+@torch.no_grad()
 def test_parts_merge_into_what_all_views_give(make_fine, make_room, moments):
     module = make_fine(moments=moments, normal_kernel=3)
     inputs = make_room(views=5)
     size = torch.tensor([0.125])
-    with torch.no_grad():
-        whole = module(*inputs)
-    parts = [module.pool(*take_views(inputs, views), size) for views in ([0, 1], [2], [3, 4])]
+    whole = module(*inputs)
+    parts = [module.pool(*take_views(inputs, views), size, capped=False) for views in ([0, 1], [2], [3, 4])]
     pooled = merge(parts)
     assert len(pooled) < sum(map(len, parts))
     ours = module.refine(pooled, size)
@@ -36,12 +36,12 @@ def test_parts_merge_into_what_all_views_give(make_fine, make_room, moments):
     assert all(torch.equal(a, b) for a, b in pairs if a is not None)
 
 
+@torch.no_grad()
 def test_a_voxel_of_one_part_stays_as_it_is(make_fine, make_room):
     module, inputs = make_fine(moments=True), make_room(views=3)
     size = torch.tensor([0.125])
-    part = module.pool(*inputs, size)
-    with torch.no_grad():
-        whole = module(*inputs)
+    part = module.pool(*inputs, size, capped=False)
+    whole = module(*inputs)
     ours = module.refine(merge([part.rows(slice(0, 0)), part]), size)
     for name in ("features", "colors", "centroid"):
         assert torch.equal(getattr(ours, name), getattr(whole, name))
@@ -50,10 +50,10 @@ def test_a_voxel_of_one_part_stays_as_it_is(make_fine, make_room):
     assert torch.equal(merge([part, far]).features[: len(part)], part.features)
 
 
+@torch.no_grad()
 def test_the_cap_holds_for_merged_voxels(make_fine, make_room):
     inputs, size = make_room(views=4), torch.tensor([0.125])
     module = make_fine(max_voxels=50)
-    with torch.no_grad():
-        whole = module(*inputs)
-    parts = [module.pool(*take_views(inputs, views), size) for views in ([0, 1], [2, 3])]
-    assert torch.equal(module.refine(merge(parts), size).grid, whole.grid)
+    whole = module(*inputs)
+    parts = [module.pool(*take_views(inputs, views), size, capped=False) for views in ([0, 1], [2, 3])]
+    assert torch.equal(module.refine(module.limited(merge(parts)), size).grid, whole.grid)

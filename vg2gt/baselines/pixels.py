@@ -14,7 +14,7 @@ from backends.base import Backend
 from vg2gt.geometry.cameras import invert_rigid, ray_directions
 from vg2gt.geometry.spherical_harmonics import rgb_to_sh, rotation_of_coefficients
 from vg2gt.method.knn import nearest_in_scenes
-from vg2gt.model import Background, Reconstructor, SceneScale
+from vg2gt.model import Background, Reconstructor, SceneScale, background_sums
 from vg2gt.profiling import stage
 from vg2gt.types import Gaussians, Geometry, Hints, Prediction, TensorRecord, Tokens, check_choice
 from vg2gt.visibility import ViewCheck
@@ -112,7 +112,7 @@ class PixelReconstructor(Reconstructor):
         with stage("gaussians"), torch.autocast(images.device.type, enabled=False):
             pixels = usable_pixels(geometry.where(keep), images)
             gaussians = self.make_gaussians(features.index_select(0, pixels.rows).float(), pixels, views)
-        gaussians = self.with_background(gaussians, images, geometry.depth)
+        gaussians = self.with_background(gaussians, background_sums(images, geometry.depth))
         return Prediction(geometry, geometry, unit, None, gaussians, keep)
 
     def features(self, tokens: Tokens, images: Tensor) -> Tensor:

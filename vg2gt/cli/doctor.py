@@ -24,11 +24,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Prints each finding on one line, as soon as it is known."""
     flag_parser("doctor").parse_args(argv)
     with errors_in_one_line():
-        for what, found in findings():
+        for what, found in _findings():
             print(f"{what:<12} {found}", flush=True)
 
 
-def findings() -> Iterator[tuple[str, str]]:
+def _findings() -> Iterator[tuple[str, str]]:
     """Yields what is checked and the result."""
     yield "vg2gt", f"{vg2gt.__version__} ({vg2gt.source()}), Python {platform.python_version()}, {platform.platform()}"
     yield "packages", ", ".join(f"{name} {_version(name)}" for name in NEEDED)

@@ -51,17 +51,13 @@ def main(argv: Sequence[str] | None = None) -> None:
     arguments = flag_parser("reconstruct", OVERRIDES + listing(OUTPUTS))
     add = arguments.add_argument
     add("images", nargs="+", help="image files, a folder of them, a video, or a recording with known cameras")
-    place = arguments.add_mutually_exclusive_group(required=True).add_argument
-    place("--out", metavar="DIR", help="where to write")
-    place("--add", metavar="DIR", help="add images with given cameras to the scene in DIR, made with --keep-windows")
-    place("--take-out", metavar="DIR", help="remove the images of one --add from the scene in DIR")
+    add("--out", metavar="DIR", required=True, help="where to write")
     add("--ckpt", metavar="PATH", help="a checkpoint or a run's folder; default: the shipped weights for "
         "backend=sweep, an untrained head for others")  # fmt: skip
     add("--poses", choices=("auto", "given", "sfm"), default="auto", help=POSES)
     add("--size", type=_size, metavar="N|HxW", help="longer side, or height x width, in pixels; default 518, CPU 280")
     add("--max-images", type=int, metavar="N", help="use at most N, evenly spaced; default: all, 32 of a video")
     add("--window", type=int, metavar="N", help=WINDOW)
-    add("--keep-windows", action="store_true", help="keep what --add and --take-out need in DIR/windows")
     add("--quality", choices=("draft", "normal", "high"), default="normal", help=QUALITY)
     add("--refine", type=int, metavar="N", help=REFINE)
     add("--mesh-voxel", type=float, metavar="X", help="edge of the mesh's voxels in scene units")
@@ -88,13 +84,11 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     from vg2gt.reconstruction.frame import place_lines
     from vg2gt.reconstruction.refined import refinement_lines
     from vg2gt.reconstruction.trust import trust_lines, trusted
-    from vg2gt.reconstruction.windows.store import remove, tidy
+    from vg2gt.reconstruction.windows.store import remove
     from vg2gt.runs.load import choose_device
 
-    changed = options.add or options.take_out
-    options.out = str(Path(changed or options.out).expanduser())
-    options.overwrite |= changed is not None
-    how_to_refine = [each for each in overrides if each.startswith(("refine=", "refine."))]
+    options.out = str(Path(options.out).expanduser())
+    how_to_refine = [each for each in overrides if each.lstrip("+").startswith(("refine=", "refine."))]
     overrides = [each for each in overrides if each not in how_to_refine]
     _check(options, overrides)
     check_refinement(options.refine, options.quality, how_to_refine)
@@ -125,10 +119,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
                 figures=figures,
                 monitor=monitor,
             )
-    if changed or options.keep_windows:
-        tidy(folder / WINDOWS)
-    else:
-        remove(folder / WINDOWS)
+    remove(folder / WINDOWS)
     cost = cost_figures(monitor)
     times = ", ".join(f"{name} {seconds:.1f}" for name, seconds in cost["seconds"].items() if seconds >= 0.05)
     height, width = scene.cameras.size
@@ -150,12 +141,6 @@ def _check(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     from vg2gt.reconstruction.windows.store import window_size
     from vg2gt.runs.load import backend_class
 
-    if options.add or options.take_out:
-        fixed = {"--poses sfm": options.poses == "sfm", "--size": options.size, "--max-images": options.max_images}
-        fixed |= {"--calibration": options.calibration, "--drop": options.drop}
-        fixed |= {"--min-confidence": options.min_confidence is not None}
-        if useless := [name for name, given in fixed.items() if given]:
-            raise ValueError(f"{', '.join(useless)} cannot be combined with --add or --take-out")
     check_outputs(options.save)
     check_folder(options.out, options.save, options.overwrite)
     check_limit(options.max_images)
@@ -166,19 +151,10 @@ def _check(options: argparse.Namespace, overrides: Sequence[str]) -> None:
 
 
 def _scene(options: argparse.Namespace, ready: Pipeline, overrides: Sequence[str], monitor: Monitor) -> Scene:
-    """Makes a new scene, or adds images to the one in the folder, or removes some; refines it if it is to be."""
-    from vg2gt.api import refined
-    from vg2gt.outputs.saved import read_scene
-    from vg2gt.reconstruction.pipeline import add_images, take_out
-    from vg2gt.reconstruction.windows.run import device_of, window_model
+    """Makes the scene with the options of the command line."""
     from vg2gt.runs.load import find_calibration
 
-    renderer, out = replace(ready.renderer, mode=options.mode), Path(options.out)
-    if options.add or options.take_out:
-        change, model = add_images if options.add else take_out, window_model(ready.model)
-        old = read_scene(out, renderer, device_of(model))
-        scene = change(model, old, out, options.images, monitor, options.window)
-        return refined(scene, options.refine, options.quality, overrides, monitor)
+    renderer = replace(ready.renderer, mode=options.mode)
     calibration = ready.calibration
     if options.calibration is not None:
         calibration = find_calibration(ready.model, ready.weights, options.calibration)
@@ -191,8 +167,7 @@ def _scene(options: argparse.Namespace, ready: Pipeline, overrides: Sequence[str
         max_images=options.max_images,
         poses=options.poses,
         window=options.window,
-        folder=out,
-        keep_windows=options.keep_windows,
+        folder=options.out,
         monitor=monitor,
     )
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,7 +14,7 @@ from torch import Tensor
 from vg2gt.io.errors import DataError
 from vg2gt.types import TensorRecord
 
-__all__ = ["DataError", "Frames", "SceneSource", "SourceMaker", "training_frames"]
+__all__ = ["DataError", "Frames", "SceneSource", "SourceMaker", "made", "training_frames"]
 
 
 @dataclass(frozen=True)
@@ -117,3 +119,21 @@ def training_frames(source: SceneSource, scene: str) -> list[int]:
     """Returns the frame ids of a scene that training may use: all but the held-out ones."""
     held_out = set(source.held_out(scene))
     return [frame for frame in source.frames(scene) if frame not in held_out]
+
+
+def made(make: SceneSource | SourceMaker, options: Mapping[str, Any]) -> SceneSource:
+    """Returns a source as it is, or makes it with the options ``data.*`` of a configuration.
+
+    Raises:
+        DataError: if its class does not take one of the options, or needs another.
+    """
+    if isinstance(make, SceneSource):
+        return make
+    try:
+        inspect.signature(make).bind(**options)
+    except TypeError as error:
+        raise DataError(
+            f"the dataset's loader does not accept these options (data.*): {error}; remove the option; if a preset "
+            "(evaluation=synthetic) sets it, choose another preset or remove it with '~data.NAME'"
+        ) from error
+    return make(**options)

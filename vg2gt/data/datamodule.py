@@ -14,7 +14,7 @@ import torch
 from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader
 
-from vg2gt.data.base import DataError, SceneSource, SourceMaker
+from vg2gt.data.base import SceneSource, SourceMaker, made
 from vg2gt.data.batches import BatchDataset
 from vg2gt.data.overlap import refuse_overlap, refuse_untrainable
 from vg2gt.data.transforms import resize_to_cover
@@ -136,11 +136,11 @@ class SceneDataModule(LightningDataModule):
 
     def train_source(self) -> SceneSource:
         """Returns the training source, without checks or limits."""
-        return self._source(self._make_train)
+        return made(self._make_train, self.common)
 
     def val_source(self) -> SceneSource:
         """Returns the evaluation source, without checks or limits."""
-        return self._source(self._make_val)
+        return made(self._make_val, self.common)
 
     def train_dataloader(self) -> DataLoader[Batch]:
         """Returns batches from the trainer's current step on; one item of the loader is one batch."""
@@ -176,20 +176,7 @@ class SceneDataModule(LightningDataModule):
 
     def evaluation_data(self) -> BatchDataset:
         """Returns the evaluation scenes as a dataset that is indexed by tuples of ``SceneSample``, for any views."""
-        return BatchDataset(self._source(self._make_val), self.prepare, self.memory_mb)
-
-    def _source(self, make: SceneSource | SourceMaker) -> SceneSource:
-        if isinstance(make, SceneSource):
-            return make
-        try:
-            return make(**self.common)
-        except TypeError as error:
-            if "argument" not in str(error):  # not Python's message about an unknown or missing argument
-                raise
-            raise DataError(
-                f"the dataset's loader does not accept these options (data.*): {error}; remove the option; if a preset "
-                "(evaluation=synthetic) sets it, choose another preset or remove it with '~data.NAME'"
-            ) from error
+        return BatchDataset(made(self._make_val, self.common), self.prepare, self.memory_mb)
 
     @property
     def loader_processes(self) -> int:

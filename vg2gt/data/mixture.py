@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from itertools import chain, zip_longest
 from typing import Any
 
-from vg2gt.data.base import DataError, Frames, SceneSource, SourceMaker
+from vg2gt.data.base import DataError, Frames, SceneSource, SourceMaker, made
 
 
 class Mixture(SceneSource):
@@ -102,17 +102,15 @@ def _check(parts: Mapping[str, object], weights: Mapping[str, float]) -> None:
 
 def _make(name: str, part: SceneSource | SourceMaker, names: Sequence[str], common: Mapping[str, Any]) -> SceneSource:
     """Makes a part with the arguments that apply to it."""
-    if isinstance(part, SceneSource):
-        return part
     owners = {key: _owner(key, names) for key in common}
     own = {key.removeprefix(f"{name}_"): common[key] for key, owner in owners.items() if owner == name}
     shared = {key: common[key] for key, owner in owners.items() if owner is None}
-    if "root" in own and not own["root"]:
+    if not isinstance(part, SceneSource) and "root" in own and not own["root"]:
         raise FileNotFoundError(
             f"data.{name}_root is not set: name the dataset's folder, or leave it out with data.weights.{name}=0"
         )
     try:
-        return part(**shared, **own)
+        return made(part, shared | own)
     except (FileNotFoundError, DataError) as error:
         raise type(error)(f"part {name} of the mixture (data.{name}_root): {error}") from error
 

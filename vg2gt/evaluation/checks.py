@@ -17,7 +17,7 @@ from vg2gt.data.views import SceneSample
 from vg2gt.model import Reconstructor
 from vg2gt.runs.checkpoints import checkpoint_path, run_config_path
 from vg2gt.runs.load import RESUMED_IN_PLACE, earlier_configs
-from vg2gt.runs.trust import check_targets, read_run_config
+from vg2gt.runs.untrusted import check_targets, read_run_config
 
 log = logging.getLogger(__name__)
 

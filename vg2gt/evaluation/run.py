@@ -264,12 +264,12 @@ class ResultStore:
 
     def picture(self, views: SceneSample) -> Path:
         """Path of a sample's picture."""
-        return self.folder / "pictures" / f"{file_name(views.scene)}-{len(views.context)}.png"
+        return self.folder / "pictures" / f"{_file_name(views.scene)}-{len(views.context)}.png"
 
     def _path(self, views: SceneSample) -> Path:
-        return self.folder / "scenes" / str(len(views.context)) / f"{file_name(views.scene)}.json"
+        return self.folder / "scenes" / str(len(views.context)) / f"{_file_name(views.scene)}.json"
 
 
-def file_name(scene: str) -> str:
+def _file_name(scene: str) -> str:
     """Encodes a scene's name as a file name without slashes, unique per scene."""
     return scene.replace("%", "%25").replace("/", "%2F")

@@ -150,6 +150,17 @@ def crop_intrinsics(intrinsics: Tensor, left: int, top: int) -> Tensor:
     return out
 
 
+def strided_intrinsics(intrinsics: Tensor, step_x: int, step_y: int) -> Tensor:
+    """Returns the intrinsics ``[..., 3, 3]`` of every ``step``-th pixel from ``step // 2`` on, along both axes.
+
+    Sampling scales the centres of pixels, unlike resizing (:func:`resize_intrinsics`), which scales their areas.
+    """
+    out = crop_intrinsics(intrinsics, step_x // 2, step_y // 2)
+    out[..., 0, :] /= step_x
+    out[..., 1, :] /= step_y
+    return out
+
+
 def camera_centers(cameras: Cameras) -> Tensor:
     """Returns camera centres ``[B, V, 3]`` in the world frame."""
     pose = cameras.world_to_camera

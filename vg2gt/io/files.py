@@ -35,7 +35,7 @@ def replacing(path: str | Path, durable: bool = False) -> Iterator[Path]:
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = temporary_name(path)
+    temporary = _temporary_name(path)
     try:
         yield temporary
         if durable:
@@ -51,7 +51,7 @@ def replacing(path: str | Path, durable: bool = False) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
 
 
-def temporary_name(path: Path) -> Path:
+def _temporary_name(path: Path) -> Path:
     """Returns a random name next to ``path``; process ids are not unique across containers."""
     return path.with_name(f".{path.name[:50]}.{secrets.token_hex(8)}.tmp")  # a name can have 255 bytes
 
@@ -107,12 +107,12 @@ def write_json(path: str | Path, content: Any) -> Path:
 def whole_folder(target: Path) -> Iterator[Path]:
     """Yields a folder to write into, which replaces ``target`` at the end of the block; on an error it is removed."""
     target = target.resolve()  # a link stays one
-    staged = temporary_name(target)
+    staged = _temporary_name(target)
     staged.mkdir(parents=True)
     try:
         yield staged
         if target.exists():
-            before = temporary_name(target)
+            before = _temporary_name(target)
             os.replace(target, before)  # removing it here would take time without either
             os.replace(staged, target)
             shutil.rmtree(before)

@@ -2,6 +2,11 @@
 
 numba detects changes only in the file that defines a kernel, but constants and functions may come from other files. The
 cache folder is therefore named by a hash of the versions and of all sources that a kernel can be made of.
+
+If a new numba breaks this: :class:`_Locator`, :class:`_Cache` and ``no_cfunc_wrapper`` rely on private names of
+``numba.core.caching``. Replace :func:`kernel` by ``numba.njit(cache=True)`` with ``numba.config.CACHE_DIR`` set to
+:func:`_folder`. Kernels stay correct; lost are the recovery from damaged files and full disks, and the safety of two
+processes that compile at once (``tests/io/test_compiled.py``).
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ _CELLS = tl.constexpr(CELLS)
 
 
 @triton.jit(do_not_specialize=("count", "bits"))
-def hilbert_kernel(grid, codes, count, bits):
+def _hilbert_kernel(grid, codes, count, bits):
     """:func:`vg2gt.kernels.curve_codes.hilbert_reference`, one lane per cell."""
     m = tl.program_id(0).to(tl.int64) * _CELLS + tl.arange(0, _CELLS)
     there = m < count
@@ -56,6 +56,6 @@ def hilbert_in_one_kernel(grid: Tensor, bits: int) -> Tensor:
     codes = grid.new_empty(len(grid))
     if len(grid):
         with torch.cuda.device_of(grid):
-            kernel: Any = hilbert_kernel  # Triton kernels are launched as kernel[grid](...)
+            kernel: Any = _hilbert_kernel  # Triton kernels are launched as kernel[grid](...)
             kernel[(-(-len(grid) // CELLS),)](grid, codes, len(grid), bits, num_warps=4)
     return codes

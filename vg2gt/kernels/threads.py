@@ -63,7 +63,8 @@ def _on_team(team: Callable[..., None], threads: int, items: Sequence[Item], fun
 def _openmp_team() -> Callable[..., None] | None:
     """Returns ``GOMP_parallel`` of the OpenMP library that torch uses, or None if it has none.
 
-    torch's threads spin while they wait: separate threads would compete with them for the cores.
+    torch's threads spin while they wait: separate threads would compete with them for the cores. If a new torch ships
+    no ``GOMP_parallel``, this returns None and a pool of threads takes over: slower, with the same results.
     """
     if sys.platform != "linux":
         return None

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from vg2gt.geometry.cameras import crop_intrinsics, unproject
+from vg2gt.geometry.cameras import strided_intrinsics, unproject
 from vg2gt.geometry.precision import full_precision
 from vg2gt.method.additions.silhouette import near_silhouettes
 from vg2gt.method.additions.surface_evidence import (
@@ -270,7 +270,6 @@ def _to_patch_rows(maps: Tensor, seen: Tensor) -> Tensor:
 
 
 def _sampled_cameras(cameras: Cameras, cell: int, size: tuple[int, int]) -> Cameras:
-    """Returns cameras whose pixels are the cells' central pixels (sampling scales pixel centres, not areas)."""
-    intrinsics = crop_intrinsics(cameras.intrinsics.detach().float(), cell // 2, cell // 2)
-    intrinsics = torch.cat((intrinsics[..., :2, :] / cell, intrinsics[..., 2:, :]), -2)
+    """Returns cameras whose pixels are the cells' central pixels."""
+    intrinsics = strided_intrinsics(cameras.intrinsics.detach().float(), cell, cell)
     return Cameras(cameras.world_to_camera.detach().float(), intrinsics, size)

@@ -11,7 +11,7 @@ from torch.nn import functional as F
 from vg2gt.types import Tokens
 
 
-class ResidualConvUnit(nn.Module):
+class _ResidualConvUnit(nn.Module):
     """``x + conv(relu(conv(relu(x))))`` with 3x3 kernels."""
 
     def __init__(self, channels: int) -> None:
@@ -24,7 +24,7 @@ class ResidualConvUnit(nn.Module):
         return x + self.conv2(F.relu(self.conv1(F.relu(x))))
 
 
-class Reassemble(nn.Module):
+class _Reassemble(nn.Module):
     """Converts the tokens of one tapped layer to a feature map at a multiple of the patch grid's resolution.
 
     Args:
@@ -88,10 +88,10 @@ class DenseHead(nn.Module):
         self.out_channels = out_channels
         self.views_per_chunk = views_per_chunk
         self.reassemble = nn.ModuleList(
-            Reassemble(dim, features, factor) for dim, factor in zip(token_dims, factors, strict=True)
+            _Reassemble(dim, features, factor) for dim, factor in zip(token_dims, factors, strict=True)
         )
-        self.refine_skip = nn.ModuleList(ResidualConvUnit(features) for _ in token_dims[1:])
-        self.refine = nn.ModuleList(ResidualConvUnit(features) for _ in token_dims)
+        self.refine_skip = nn.ModuleList(_ResidualConvUnit(features) for _ in token_dims[1:])
+        self.refine = nn.ModuleList(_ResidualConvUnit(features) for _ in token_dims)
         merge_channels = merge_channels or out_channels
         self.reduce = nn.Conv2d(features, merge_channels, 3, padding=1)
         self.image = nn.Conv2d(3, merge_channels, 3, padding=1)

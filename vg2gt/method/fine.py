@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -16,7 +15,7 @@ from vg2gt.geometry.symmetric import UPPER
 from vg2gt.kernels.point_features import PooledFeatures
 from vg2gt.kernels.threads import compilable
 from vg2gt.memory import Cap, note_sizes
-from vg2gt.method.additions.point_moments import Moments, pool_point_moments
+from vg2gt.method.additions.point_moments import COLUMNS, pool_point_moments
 from vg2gt.method.additions.silhouette import on_surface
 from vg2gt.method.additions.voxel_normals import surface_normals
 from vg2gt.method.dense_head import DenseHead
@@ -28,11 +27,12 @@ from vg2gt.method.grid import (
     pool_mean,
     pool_mean_of_chunks,
     pool_min,
+    pool_sum,
     scene_counts,
     scene_voxel_size,
 )
 from vg2gt.method.point_mlp import PointMLP
-from vg2gt.method.pooled import MOMENTS, PooledVoxels
+from vg2gt.method.pooled import PooledVoxels
 from vg2gt.types import Geometry, Tokens, VoxelMoments, Voxels
 
 log = logging.getLogger(__name__)
@@ -107,65 +107,37 @@ class FineModule(nn.Module):
         self.point_mlp = point_mlp(in_channels=width + EXTRA_CHANNELS + MOMENT_CHANNELS * moments)
         self.out_channels = self.point_mlp.out_channels
 
-    def forward(self, tokens: Tokens, geometry: Geometry, images: Tensor, coarsen: Tensor | None = None) -> Voxels:
-        """Builds the fine voxels of B scenes.
+    def voxel_edges(self, geometry: Geometry, coarsen: Tensor | None = None) -> Tensor:
+        """Returns the edge ``[B]`` of each scene's voxels in scene units.
+
+        Args:
+            geometry: as for :meth:`pool`.
+            coarsen: ``[B]`` factors on the smallest edge; None: 1.
+        """
+        if self.training and self.coarsest_drawn > 1:
+            drawn = self.coarsest_drawn ** torch.rand(len(geometry.depth), device=geometry.depth.device)
+            coarsen = drawn if coarsen is None else coarsen * drawn
+        with full_precision(geometry.depth):
+            return scene_voxel_size(geometry, self.voxel_size, self.min_footprint, coarsen)
+
+    def pool(
+        self, tokens: Tokens, geometry: Geometry, images: Tensor, size: Tensor, capped: bool = True
+    ) -> PooledVoxels:
+        """Pools the pixels of B scenes, or of some views of them; such parts can be merged.
 
         Args:
             tokens: enhanced tokens.
             geometry: decoded depth, confidence and cameras, in scene units and the frame of context view 0.
             images: ``[B, V, 3, H, W]`` in [0, 1].
-            coarsen: ``[B]`` factors on the smallest edge; None: 1.
+            size: ``[B]`` result of :meth:`voxel_edges` for the whole scenes.
+            capped: whether ``max_voxels`` applies now; for parts, it applies once they are merged (:meth:`limited`).
 
         Returns:
-            Refined voxels; differentiable in features, confidence and positions, but not in the assignment of pixels.
+            The voxels; differentiable in features, confidence and positions, but not in the assignment of pixels.
 
         Raises:
             ValueError: if a scene spans too many voxels to index.
         """
-        if self.training and self.coarsest_drawn > 1:
-            drawn = self.coarsest_drawn ** torch.rand(len(images), device=images.device)
-            coarsen = drawn if coarsen is None else coarsen * drawn
-        with full_precision(images):
-            size = scene_voxel_size(geometry, self.voxel_size, self.min_footprint, coarsen)
-        return self._refine(self._measure(tokens, geometry, images, size, capped=True), size)
-
-    @torch.no_grad()
-    def pool(self, tokens: Tokens, geometry: Geometry, images: Tensor, size: Tensor) -> PooledVoxels:
-        """Runs the per-pixel part of :meth:`forward` for some views of one scene (B = 1); the results can be merged.
-
-        Args:
-            tokens: as for :meth:`forward`.
-            geometry: as for :meth:`forward`, in the frame of the whole scene.
-            images: as for :meth:`forward`.
-            size: ``[1]`` voxel edge length of the whole scene.
-        """
-        plan, features, means, confidence, moments, weights = self._measure(
-            tokens, geometry, images, size, capped=False
-        )
-        ordered = weights[plan.order].double()
-        weight = torch.segment_reduce(ordered, "sum", lengths=plan.counts, unsafe=True) if len(plan) else ordered
-        columns = None if moments is None else torch.cat([each.reshape(len(plan), -1) for each in moments], 1)
-        return PooledVoxels(plan.grid, plan.counts, weight, confidence, features, means, columns)
-
-    @torch.no_grad()
-    def refine(self, pooled: PooledVoxels, size: Tensor) -> Voxels:
-        """Runs the rest of :meth:`forward`: refines the voxels of a whole scene.
-
-        Args:
-            pooled: merged results of :meth:`pool`.
-            size: ``[1]`` voxel edge length of the whole scene.
-        """
-        keep = self.cap(pooled.confidence, torch.zeros_like(pooled.count))
-        pooled = pooled if keep is None else pooled.rows(keep)
-        note_sizes({"voxels": len(pooled)})
-        moments = None
-        if pooled.moments is not None:
-            spread, cross, eye, pixel = pooled.moments.split(MOMENTS, 1)
-            moments = spread.unflatten(-1, (3, 3)), cross.unflatten(-1, (3, 3)), eye, pixel[:, 0]
-        parts = (pooled.features, pooled.means, pooled.confidence, moments, pooled.weight)
-        return self._refine(_Measured(pooled.plan(), *parts), size)
-
-    def _measure(self, tokens: Tokens, geometry: Geometry, images: Tensor, size: Tensor, capped: bool) -> _Measured:
         # pixels to points and their cells
         with full_precision(images):
             points = _Points(geometry, size, self.drop_fringes)
@@ -175,7 +147,7 @@ class FineModule(nn.Module):
                 keep = self.cap(pool_min(points.confidence.detach(), plan), plan.batch)
                 plan = plan if keep is None else plan.select(keep)
         # dense features to voxels: [M, C]
-        pooled = self._pool_features(tokens, images, points, plan)
+        features = self._pool_features(tokens, images, points, plan)
         # position, colour, confidence and second moments of the points in every voxel
         with full_precision(images):
             pixels = images.float().permute(0, 1, 3, 4, 2).reshape(-1, 3)  # [B V H W, 3]
@@ -183,31 +155,44 @@ class FineModule(nn.Module):
             means = pool_mean(values, points.confidence, plan)
             confidence = pool_min(points.confidence, plan)
             moments = self._pool_moments(geometry, size, values, points.confidence, means, plan)
-        return _Measured(plan, pooled, means, confidence, moments, points.confidence)
+            weight = pool_sum(points.confidence.detach().double(), plan)
+        return PooledVoxels(plan.grid, plan.batch, plan.counts, weight, confidence, features, means, moments)
 
-    def _refine(self, measured: _Measured, size: Tensor) -> Voxels:
-        plan, pooled, means, confidence, found, _ = measured
-        with full_precision(pooled):
+    def limited(self, pooled: PooledVoxels) -> PooledVoxels:
+        """Applies ``max_voxels`` to merged voxels."""
+        keep = self.cap(pooled.confidence, pooled.batch)
+        return pooled if keep is None else pooled.rows(keep)
+
+    def refine(self, pooled: PooledVoxels, size: Tensor) -> Voxels:
+        """Refines the voxels of B whole scenes.
+
+        Args:
+            pooled: result of :meth:`pool`, or several of them merged.
+            size: as for :meth:`pool`.
+        """
+        plan, means, confidence = pooled.plan(), pooled.means, pooled.confidence
+        note_sizes({"voxels": len(pooled)})
+        with full_precision(pooled.features):
             offset, colors = means.split(3, -1)
-            count = plan.counts.to(pooled.dtype)
+            count = plan.counts.to(pooled.features.dtype)
             density = torch.log(count / _scene_medians(count, plan.batch, len(size)))
             extra = [2 * colors - 1, 2 * offset, density[:, None], confidence.log()[:, None]]
             # adding before scaling keeps the centroid inside its cell in float32
             centroid = (plan.grid + 0.5 + offset.double()) * size.double()[plan.batch, None]
-            centroid = centroid.to(pooled.dtype)
+            centroid = centroid.to(pooled.features.dtype)
             moments = None
-            if found is not None:
-                moments = self._moments(found, means, centroid, plan)
+            if pooled.moments is not None:
+                moments = self._moments(pooled.moments, means, centroid, plan)
                 spread = [moments.spread[:, i, j] for i, j in zip(*UPPER, strict=True)]
                 extra += [SPREAD_SCALE * torch.stack(spread, -1), CROSS_SCALE * moments.cross.flatten(1)]
-        refined = self.point_mlp(torch.cat((pooled, *extra), -1), plan.grid, plan.batch, size)
+        refined = self.point_mlp(torch.cat((pooled.features, *extra), -1), plan.grid, plan.batch, size)
         return Voxels(refined, colors, plan.grid, plan.batch, confidence, count, centroid, size, moments)
 
     @torch.no_grad()
     def _pool_moments(
         self, geometry: Geometry, size: Tensor, values: Tensor, confidence: Tensor, means: Tensor, plan: VoxelPlan
-    ) -> Moments | None:
-        """Returns second moments of the points' positions and colours ``[N, 6]`` about their means ``[M, 6]``."""
+    ) -> Tensor | None:
+        """Returns second moments ``[M, 22]`` of the points' positions and colours ``[N, 6]`` about their means."""
         if not self.moments:
             return None
         centers = camera_centers(geometry.cameras).float()  # [B, V, 3]
@@ -217,11 +202,12 @@ class FineModule(nn.Module):
         return pool_point_moments(values, depth, confidence, views, means, plan, chunk)
 
     @torch.no_grad()
-    def _moments(self, measured: Moments, means: Tensor, centroid: Tensor, plan: VoxelPlan) -> VoxelMoments:
-        spread, cross, eye, pixel = measured
+    def _moments(self, pooled: Tensor, means: Tensor, centroid: Tensor, plan: VoxelPlan) -> VoxelMoments:
+        both, eye, pixel = pooled.split(COLUMNS, -1)
+        spread, cross = both.unflatten(-1, (3, 6)).split(3, -1)
         facing = F.normalize(eye - centroid, dim=-1)
         normal = surface_normals(spread, facing, means[:, :3], plan, self.normal_kernel)
-        return VoxelMoments(spread, cross, facing, pixel, normal)
+        return VoxelMoments(spread, cross, facing, pixel[:, 0], normal)
 
     def _pool_features(self, tokens: Tokens, images: Tensor, points: _Points, plan: VoxelPlan) -> Tensor:
         """Pools dense features to ``[M, C]``; without gradient, a few views at a time, which bounds the memory."""
@@ -237,17 +223,6 @@ class FineModule(nn.Module):
             offsets,
         )
         return pool_mean_of_chunks(chunks, points.confidence, plan)
-
-
-class _Measured(NamedTuple):
-    """Voxels with everything pooled from pixels."""
-
-    plan: VoxelPlan
-    features: Tensor  # [M, C]
-    means: Tensor  # [M, 6] position in the cell, colour
-    confidence: Tensor  # [M]
-    moments: Moments | None
-    weights: Tensor  # [N] confidence of the points, or [M] summed per voxel
 
 
 def _pixel_rows(dense: Tensor) -> Tensor:

@@ -221,6 +221,12 @@ def pool_min(values: Tensor, plan: VoxelPlan) -> Tensor:
     return torch.segment_reduce(ordered, "min", lengths=plan.counts, unsafe=True) if len(plan) else ordered
 
 
+def pool_sum(values: Tensor, plan: VoxelPlan) -> Tensor:
+    """Returns the sum ``[M]`` of the points' ``[N]`` values in every voxel."""
+    ordered = values[plan.order]
+    return torch.segment_reduce(ordered, "sum", lengths=plan.counts, unsafe=True) if len(plan) else ordered
+
+
 def scene_voxel_size(
     geometry: Geometry, voxel_size: float, min_footprint: float, coarsen: Tensor | None = None
 ) -> Tensor:

@@ -13,7 +13,7 @@ from vg2gt.method.serialization import Order, Windows, make_windows, relative_gr
 STAGE_ORDERS: tuple[Order, ...] = ("hilbert", "hilbert-trans", "z", "z-trans")
 
 
-class ResidualPointBlock(nn.Module):
+class _ResidualPointBlock(nn.Module):
     """``x + W2 relu(W1 LN(x))`` on every row."""
 
     def __init__(self, channels: int) -> None:
@@ -43,8 +43,8 @@ class GeometricStage(nn.Module):
         self.alpha = nn.Parameter(torch.ones(channels + 3))
         self.beta = nn.Parameter(torch.zeros(channels + 3))
         self.inner = nn.Linear(2 * channels + 3, channels)
-        self.before = ResidualPointBlock(channels)
-        self.after = ResidualPointBlock(channels)
+        self.before = _ResidualPointBlock(channels)
+        self.after = _ResidualPointBlock(channels)
         self.out = nn.Linear(2 * channels, channels)
         self.gamma = nn.Parameter(torch.ones(channels))
 

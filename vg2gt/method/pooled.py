@@ -11,24 +11,25 @@ from torch import Tensor
 from vg2gt.method.grid import VoxelPlan, mixed_radix_keys
 from vg2gt.types import TensorRecord
 
-MOMENTS = (9, 9, 3, 1)  # numbers of columns: spread, covariance with colour, camera centre, side of a pixel
-
 
 @dataclass(frozen=True)
 class PooledVoxels(TensorRecord):
-    """Confidence-weighted means of the points in M voxels of one scene, sorted by cell (x, y, z).
+    """Confidence-weighted means of the points in M voxels, sorted by scene and cell (x, y, z).
 
     Attributes:
         grid: ``[M, 3]`` int64 cells.
+        batch: ``[M]`` int64 scene index.
         count: ``[M]`` int64 number of points.
         weight: ``[M]`` float64 sum of the points' confidences.
         confidence: ``[M]`` the smallest of them.
         features: ``[M, C]`` mean feature.
         means: ``[M, 6]`` mean position relative to the cell centre, in cells, and mean colour.
-        moments: ``[M, 22]`` second moments about these means (:data:`MOMENTS`); None unless requested.
+        moments: ``[M, 22]`` second moments about these means
+            (:func:`vg2gt.method.additions.point_moments.pool_point_moments`); None unless requested.
     """
 
     grid: Tensor
+    batch: Tensor
     count: Tensor
     weight: Tensor
     confidence: Tensor
@@ -46,7 +47,7 @@ class PooledVoxels(TensorRecord):
     def plan(self) -> VoxelPlan:
         """Returns the voxels as a plan without points."""
         none = self.grid.new_zeros(0)
-        return VoxelPlan(self.grid, torch.zeros_like(self.count), none, none, self.count, none)
+        return VoxelPlan(self.grid, self.batch, none, none, self.count, none)
 
 
 def merge(parts: Sequence[PooledVoxels]) -> PooledVoxels:
@@ -59,7 +60,7 @@ def merge(parts: Sequence[PooledVoxels]) -> PooledVoxels:
         parts: at least one; all with the same feature width, and either all or none with moments.
     """
     joined = concatenate(parts)
-    keys, order = torch.sort(mixed_radix_keys(joined.grid, torch.zeros_like(joined.count))[0], stable=True)
+    keys, order = torch.sort(mixed_radix_keys(joined.grid, joined.batch)[0], stable=True)
     lengths = torch.unique_consecutive(keys, return_counts=True)[1]
     first = order[lengths.cumsum(0) - lengths]
     if len(first) == len(joined):
@@ -81,6 +82,7 @@ def merge(parts: Sequence[PooledVoxels]) -> PooledVoxels:
         moments = torch.cat((raw[:, :18] - _products(means), raw[:, 18:]), 1).to(moments.dtype)
     merged = PooledVoxels(
         grid=joined.grid[first],
+        batch=joined.batch[first],
         count=reduced(joined.count.double()).long(),
         weight=total,
         confidence=reduced(joined.confidence, "min"),
@@ -103,6 +105,5 @@ def concatenate(parts: Sequence[PooledVoxels]) -> PooledVoxels:
 
 
 def _products(means: Tensor) -> Tensor:
-    """Returns ``[M, 18]``: position times position, and position times colour."""
-    place, color = means.split(3, -1)
-    return torch.cat([(place[:, :, None] * other[:, None]).flatten(1) for other in (place, color)], -1)
+    """Returns ``[M, 18]``: position ``[3]`` times position and colour ``[6]``."""
+    return (means[:, :3, None] * means[:, None]).flatten(1)

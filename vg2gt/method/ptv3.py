@@ -58,7 +58,7 @@ class Level:
         return self._windows[which, length]
 
 
-def make_levels(
+def _make_levels(
     grid: Tensor,
     batch: Tensor,
     scenes: int,
@@ -151,7 +151,7 @@ class MLP(nn.Module):
         return self.fc2(F.gelu(self.fc1(x)))
 
 
-class PTv3Block(nn.Module):
+class _PTv3Block(nn.Module):
     """Conditional positional encoding by sparse convolution (xCPE), attention and MLP, each residual.
 
     Args:
@@ -189,7 +189,7 @@ class PTv3Block(nn.Module):
         return branch * kept / (1 - self.drop_path)
 
 
-class GridPool(nn.Module):
+class _GridPool(nn.Module):
     """Max pooling into cells of twice the size, after a projection."""
 
     def __init__(self, in_channels: int, out_channels: int, norm: Norm) -> None:
@@ -208,7 +208,7 @@ class GridPool(nn.Module):
         return F.gelu(self.norm[0](pooled))
 
 
-class GridUnpool(nn.Module):
+class _GridUnpool(nn.Module):
     """Copies parents' features to their voxels and adds the skip connection, both projected."""
 
     def __init__(self, in_channels: int, skip_channels: int, out_channels: int, norm: Norm) -> None:
@@ -287,7 +287,7 @@ class PTv3(nn.Module):
 
         def blocks(channels: int, heads: int, rates: list[float]) -> dict[str, nn.Module]:
             return {
-                f"block{i}": PTv3Block(channels, heads, window, i % len(ORDERS), mlp_ratio, rate)
+                f"block{i}": _PTv3Block(channels, heads, window, i % len(ORDERS), mlp_ratio, rate)
                 for i, rate in enumerate(rates)
             }
 
@@ -296,11 +296,11 @@ class PTv3(nn.Module):
         self.enc = nn.ModuleDict()
         self.dec = nn.ModuleDict()
         for s in range(stages):
-            down = {"down": GridPool(enc_channels[s - 1], enc_channels[s], norm)} if s else {}
+            down = {"down": _GridPool(enc_channels[s - 1], enc_channels[s], norm)} if s else {}
             self.enc[f"enc{s}"] = nn.ModuleDict({**down, **blocks(enc_channels[s], enc_heads[s], enc_rates[s])})
         below = [*dec_channels, enc_channels[-1]]
         for s in reversed(range(stages - 1)):
-            up = {"up": GridUnpool(below[s + 1], enc_channels[s], dec_channels[s], norm)}
+            up = {"up": _GridUnpool(below[s + 1], enc_channels[s], dec_channels[s], norm)}
             self.dec[f"dec{s}"] = nn.ModuleDict({**up, **blocks(dec_channels[s], dec_heads[s], dec_rates[s])})
 
     def forward(
@@ -334,7 +334,7 @@ class PTv3(nn.Module):
         bits = max(1, len(self.enc) - 1)
         keys = serial_keys(local, batch, voxel_size, ORDERS, bits, max(extent))
         kernels = [{self.stem_kernel, 3}, *[{3}] * (len(self.enc) - 1)]
-        levels = make_levels(local, batch, len(voxel_size), keys, extent, [[*sizes] for sizes in kernels], generator)
+        levels = _make_levels(local, batch, len(voxel_size), keys, extent, [[*sizes] for sizes in kernels], generator)
         # stem: [M, in_channels] to [M, enc_channels[0]]
         stem, level = self.embedding["stem"], levels[0]
         features = F.gelu(stem["norm"](stem["conv"](features, level.pairs[self.stem_kernel])))  # pyright: ignore

@@ -69,7 +69,7 @@ def serial_keys(
 
 
 @dataclass(frozen=True)
-class WindowGroup:
+class _WindowGroup:
     """Windows of one length. Scenes with fewer voxels than the requested length are in groups of their own.
 
     Attributes:
@@ -93,7 +93,7 @@ class Windows:
         owner: ``[M]`` position of every voxel in the concatenation of all groups' ``rows.flatten()``.
     """
 
-    groups: tuple[WindowGroup, ...]
+    groups: tuple[_WindowGroup, ...]
     owner: Tensor
 
 
@@ -125,5 +125,5 @@ def make_windows(order: Tensor, counts: list[int], length: int, shift: int = 0) 
             owner[voxels] = base + window * size + place - inside[window]
             rows.append(voxels[inside[:, None] + torch.arange(size, device=order.device)])  # [W, K]
             base += len(inside) * size
-        groups.append(WindowGroup(torch.cat(rows), tuple(map(len, rows))))
+        groups.append(_WindowGroup(torch.cat(rows), tuple(map(len, rows))))
     return Windows(tuple(groups), owner)

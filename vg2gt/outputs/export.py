@@ -32,7 +32,7 @@ _QUALITY = 95  # of re-encoded JPEGs
 
 
 @dataclass(frozen=True)
-class ExportedViews:
+class _ExportedViews:
     """The views of a scene with images of their own sizes.
 
     Attributes:
@@ -93,7 +93,7 @@ class ExportedViews:
         return owner[kept], view[kept], pixel[kept]
 
 
-def exported_views(scene: Scene) -> ExportedViews:
+def exported_views(scene: Scene) -> _ExportedViews:
     """Returns the views with whole photographs if known, else with the images at the working size."""
     named = scene.named_cameras()
     poses = torch.from_numpy(np.stack([camera.world_to_camera for camera in named]))
@@ -105,7 +105,7 @@ def exported_views(scene: Scene) -> ExportedViews:
     if len({name.lower() for name in names}) < len(names):
         names = [f"{camera.name[:-4]}{Path(name).suffix}" for camera, name in zip(named, names, strict=True)]
     cameras = Cameras(poses[None], torch.from_numpy(np.stack([each.intrinsics for each in shown]))[None], sizes[0])
-    return ExportedViews(cameras, sizes, tuple(names), scene.pictures if named[0].photo else (None,) * len(named))
+    return _ExportedViews(cameras, sizes, tuple(names), scene.pictures if named[0].photo else (None,) * len(named))
 
 
 def _with_folders(names: list[str], pictures: Sequence[Picture]) -> list[str]:

@@ -150,16 +150,16 @@ def write_outputs(
                 advance()
     sinks = [map_folder(folder, output) for output in outputs if output in MAPS]
     if meshes := [folder / output for output in outputs if output.startswith("mesh")]:
-        sinks.append(mesh_fusion(scene, meshes, mesh_voxel))
+        sinks.append(_mesh_fusion(scene, meshes, mesh_voxel))
     if sinks:
         with monitor.stage("render views", len(scene.names)) as advance:
             feed(scene.render(), sinks, advance)
     if "report.json" in outputs:
-        write_json(folder / "report.json", {**scene_figures(scene), **(figures or {}), **cost_figures(monitor)})
+        write_json(folder / "report.json", {**_scene_figures(scene), **(figures or {}), **cost_figures(monitor)})
     return folder
 
 
-def scene_figures(scene: Scene) -> dict[str, Any]:
+def _scene_figures(scene: Scene) -> dict[str, Any]:
     """Returns the report entries of a scene."""
     height, width = scene.cameras.size
     return {
@@ -239,7 +239,7 @@ def feed(views: Iterable[RenderedView], sinks: Sequence[Sink], advance: Callable
 
 
 @contextmanager
-def mesh_fusion(scene: Scene, paths: Sequence[Path], voxel_size: float | None) -> Iterator[AddView]:
+def _mesh_fusion(scene: Scene, paths: Sequence[Path], voxel_size: float | None) -> Iterator[AddView]:
     """Collects the rendered depth and colour of the views, fuses them into a mesh and writes it to the paths.
 
     Rendered surfaces that no view has measured are left out.

@@ -102,7 +102,7 @@ def move_to_target(frame: SceneFrame, cameras: Cameras, depth: float) -> tuple[S
             move[:3, :3] = _turned_down(-place.up)
         else:
             move[:3, :3] = upright_rotation(cameras.world_to_camera[0].detach().cpu().double().numpy())
-    return replace(frame, name=frame.target, to_source=frame.to_source @ np.linalg.inv(move)), similarity_of(move)
+    return replace(frame, name=frame.target, to_source=frame.to_source @ np.linalg.inv(move)), _similarity_of(move)
 
 
 def upright_rotation(poses: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -149,7 +149,7 @@ def moved_cameras(cameras: Cameras, move: Similarity, frame: SceneFrame) -> tupl
     return replace(cameras, world_to_camera=moved[None]), poses
 
 
-def similarity_of(matrix: NDArray[np.float64]) -> Similarity:
+def _similarity_of(matrix: NDArray[np.float64]) -> Similarity:
     """Returns the similarity (B = 1) of a matrix ``[4, 4]``."""
     linear, shift = torch.from_numpy(matrix[:3, :3].copy()), torch.from_numpy(matrix[:3, 3].copy())
     scale = torch.linalg.det(linear) ** (1 / 3)

@@ -1,4 +1,4 @@
-"""From images to a scene in one call; adds images to a scene that was made in windows, and removes them again."""
+"""From images to a scene in one call."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from vg2gt.geometry.cameras import camera_centers
@@ -20,31 +19,21 @@ from vg2gt.geometry.precision import half_precision_on_gpu
 from vg2gt.inputs.camera_source import CameraSource
 from vg2gt.inputs.cameras import Poses, pictures_for
 from vg2gt.inputs.folders import is_photo
-from vg2gt.inputs.inputs import Views, as_given, in_order, load_views, source_of, working_order, working_size
+from vg2gt.inputs.inputs import Views, as_given, in_order, load_views, working_order, working_size
 from vg2gt.inputs.padding import padded
 from vg2gt.inputs.pictures import ImagesLike, Picture
-from vg2gt.io.files import by_number
 from vg2gt.io.image_files import gps_position
 from vg2gt.memory import RECONSTRUCTION, memory_advice, note_sizes
-from vg2gt.model import VG2GT, Reconstructor
+from vg2gt.model import Reconstructor
 from vg2gt.monitor import Monitor
-from vg2gt.reconstruction.frame import SceneFrame, first_frame, similarity_of
+from vg2gt.reconstruction.frame import SceneFrame, first_frame
 from vg2gt.reconstruction.scene import Scene
 from vg2gt.reconstruction.surroundings import with_surroundings
 from vg2gt.reconstruction.trust import pixel_trust
-from vg2gt.reconstruction.windows import WINDOWS
-from vg2gt.reconstruction.windows.run import WindowRun, device_of, gaussians_of, set_key, window_model
-from vg2gt.reconstruction.windows.store import (
-    Anchor,
-    finished_sets,
-    key_of,
-    mark_taken_out,
-    read_anchor,
-    was_taken_out,
-    window_size,
-)
+from vg2gt.reconstruction.windows.run import WindowRun, device_of, window_model
+from vg2gt.reconstruction.windows.store import window_size
 from vg2gt.rendering import Renderer
-from vg2gt.types import Cameras, Gaussians, Geometry
+from vg2gt.types import Gaussians, Geometry
 from vg2gt.uncertainty import Calibration
 
 log = logging.getLogger(__name__)
@@ -63,8 +52,6 @@ def reconstruct_with(
     sfm_folder: str | Path | None = None,
     window: int | None = None,
     window_folder: str | Path | None = None,
-    keep_windows: bool = False,
-    anchor: Anchor | None = None,
     calibration: Calibration | None = None,
 ) -> Scene:
     """Reconstructs a scene from any number of images, feed-forward; :mod:`vg2gt.api` then refines it.
@@ -82,8 +69,6 @@ def reconstruct_with(
             (:mod:`vg2gt.reconstruction.windows`); 0: all at once; None: 24 if there are more than 100, else all.
         window_folder: folder for finished windows, from which an interrupted reconstruction resumes; None: a temporary
             one.
-        keep_windows: always process in windows, because their voxels are kept.
-        anchor: anchor of the scene to add the images to (:mod:`vg2gt.reconstruction.windows.store`).
         calibration: calibration of the model, from which errors are stated; None, or in windows: no stated errors.
 
     Returns:
@@ -100,25 +85,23 @@ def reconstruct_with(
     chosen = pictures_for(model, images, poses, max_images=max_images, sfm_folder=sfm_folder, monitor=monitor)
     with memory_advice(RECONSTRUCTION), chosen as pictures:
         sizes = [picture.size for picture in pictures]
-        target = anchor.size if anchor else working_size(sizes, model.backend.patch_size, device_of(model).type, size)
+        target = working_size(sizes, model.backend.patch_size, device_of(model).type, size)
         pictures = [padded(picture, target) for picture in pictures]
         note_sizes({f"images of {target[0]}x{target[1]}": len(pictures)})
-        if images_at_a_time := window_size(window, len(pictures), keep_windows or anchor is not None):
+        if images_at_a_time := window_size(window, len(pictures)):
             # memory-mapped files stay readable after their removal
             with TemporaryDirectory(prefix="vg2gt-windows-", ignore_cleanup_errors=True) as temporary:
                 place = Path(window_folder or temporary)
-                windows = WindowRun(
-                    window_model(model.eval()), pictures, target, images_at_a_time, place, monitor, anchor
-                )
-                parts = _in_windows(windows, pictures)
+                run = WindowRun(window_model(model.eval()), pictures, target, images_at_a_time, place, monitor)
+                parts = _Parts(*run.geometry_and_gaussians(), run.capture.images, run.capture.mask)
         else:
             parts = _at_once(model.eval(), load_views(pictures, target, monitor), monitor, calibration)
     scene = _scene(parts, pictures, renderer or Renderer(), model.backend.is_metric)
-    return (scene if anchor else with_surroundings(scene, model.visibility is not None)).placed()
+    return with_surroundings(scene, model.visibility is not None).placed()
 
 
 class _Parts(NamedTuple):
-    """What a reconstruction computes; ``error``, ``support`` and ``to_source`` as in :class:`Scene`."""
+    """What a reconstruction computes; ``error`` and ``support`` as in :class:`Scene`."""
 
     geometry: Geometry
     gaussians: Gaussians
@@ -127,13 +110,6 @@ class _Parts(NamedTuple):
     mask: Tensor | None
     error: Tensor | None = None
     support: Tensor | None = None
-    to_source: NDArray[np.float64] | None = None
-
-
-def _in_windows(run: WindowRun, pictures: Sequence[Picture]) -> _Parts:
-    geometry, gaussians, unit = run.geometry_and_gaussians()
-    to_source = run.anchor.to_source if run.anchor and source_of(pictures) else None
-    return _Parts(geometry, gaussians, unit, run.capture.images, run.capture.mask, to_source=to_source)
 
 
 def _at_once(model: Reconstructor, views: Views, monitor: Monitor, calibration: Calibration | None) -> _Parts:
@@ -157,10 +133,7 @@ def _scene(parts: _Parts, pictures: Sequence[Picture], renderer: Renderer, is_me
     given = np.stack(known) if source and len(known) == len(pictures) else None
     target = "given" if CameraSource.of(source) in (CameraSource.GIVEN, CameraSource.RECORDED) else "upright"
     frame = first_frame(geometry.cameras, float(parts.unit), given, target)
-    if parts.to_source is not None:
-        frame = replace(frame, to_source=parts.to_source)  # same for all sets, and their place is that of the first
-    else:
-        frame = replace(frame, place=_place(geometry.cameras, frame, pictures))
+    frame = replace(frame, place=_place(geometry.cameras, frame, pictures))
     metres = frame.scale if pictures[0].is_metric else None
     if frame.world_place is not None and metres is None:
         metres = frame.world_place.scale
@@ -194,114 +167,3 @@ def _place(cameras: Cameras, frame: SceneFrame, pictures: Sequence[Picture]) -> 
     if place is None:
         log.warning("the GPS positions of the photographs are too few or too coarse to give the scene a scale")
     return place
-
-
-def add_images(
-    model: VG2GT, scene: Scene, folder: Path, images: ImagesLike, monitor: Monitor, window: int | None = None
-) -> Scene:
-    """Adds images, whose cameras are given in the same frame, to a scene; writes no outputs.
-
-    Args:
-        model: model that made the scene.
-        scene: the scene, as read from the folder (:func:`vg2gt.outputs.saved.read_scene`).
-        folder: output folder of ``vg2gt reconstruct --keep-windows``.
-        images: see :func:`vg2gt.inputs.pictures.find_pictures`.
-        monitor: shows and times the stages.
-        window: see :func:`reconstruct_with`.
-
-    Returns:
-        The scene with the images.
-
-    Raises:
-        FileNotFoundError: if the folder keeps no voxels.
-        ValueError: if another model made the scene, it has images of the same names, or a removal is unfinished.
-    """
-    anchor = _anchor(model, folder)
-    if any(was_taken_out(place) for place in (folder / WINDOWS).iterdir()):
-        raise ValueError(f"a --take-out from {folder} was interrupted: repeat it first")
-    with pictures_for(model, images, "given") as pictures:
-        there = sorted({picture.name for picture in pictures} & set(scene.names))
-    if there:
-        raise ValueError(f"the scene already has images with these names: {', '.join(there[:10])}; rename them")
-    new = reconstruct_with(
-        model,
-        images,
-        renderer=scene.renderer,
-        monitor=monitor,
-        poses="given",
-        window=window,
-        window_folder=folder / WINDOWS,
-        anchor=anchor,
-    )
-    return with_surroundings(_joined(scene, new), model.visibility is not None)
-
-
-def take_out(
-    model: VG2GT, scene: Scene, folder: Path, images: ImagesLike, monitor: Monitor, window: int | None = None
-) -> Scene:
-    """Removes images that one command added from a scene; arguments as for :func:`add_images`.
-
-    Their voxels stay in the folder until ``windows.store.tidy``, which is called once the scene is written.
-
-    Raises:
-        FileNotFoundError: if the folder keeps no voxels.
-        ValueError: if another model made the scene, or exactly these images were not added together.
-    """
-    anchor, kept = _anchor(model, folder), folder / WINDOWS
-    with pictures_for(model, images, "given") as pictures:
-        names = {picture.name for picture in pictures}
-        size = window_size(window, len(pictures), kept=True)
-        place = kept / set_key(model, pictures, anchor.size, size, anchor)[:12]
-    if place not in finished_sets(kept) and not was_taken_out(place):
-        raise ValueError("these images were not added by one command: give the same folder and the same --window")
-    left = [view for view, name in enumerate(scene.names) if name not in names]
-    if not left:
-        raise ValueError("no image would be left in the scene")
-    gaussians = gaussians_of(model, kept, anchor, monitor, left_out=place)
-    moved = similarity_of(anchor.to_source).apply_gaussians(gaussians)
-    scene = replace(_with_views(scene, left), gaussians=moved)
-    mark_taken_out(place)
-    return with_surroundings(scene, model.visibility is not None)
-
-
-def _anchor(model: VG2GT, folder: Path) -> Anchor:
-    anchor = read_anchor(folder / WINDOWS)
-    if anchor.model != key_of(window_model(model)):
-        raise ValueError(f"{folder} was made with another model: take the same backend, checkpoint and options")
-    return anchor
-
-
-def _joined(old: Scene, new: Scene) -> Scene:
-    """Joins the views of two scenes in one frame, sorted by name, with the Gaussians of the second."""
-
-    def both(one: Tensor, other: Tensor) -> Tensor:
-        return torch.cat((one.to(other.device), other))
-
-    masks = [torch.ones_like(each.depth) if each.mask is None else each.mask for each in (old, new)]
-    poses = both(old.cameras.world_to_camera[0], new.cameras.world_to_camera[0])[None]
-    intrinsics = both(old.cameras.intrinsics[0], new.cameras.intrinsics[0])[None]
-    scene = replace(
-        new,
-        cameras=Cameras(poses, intrinsics, new.cameras.size),
-        mask=None if old.mask is None and new.mask is None else both(*masks),
-        names=(*old.names, *new.names),
-        renderer=old.renderer,
-        metres_per_unit=old.metres_per_unit,
-        frame=new.frame if new.frame is None or old.frame is None else replace(new.frame, place=old.frame.place),
-        poses=None if old.poses is None or new.poses is None else both(old.poses, new.poses),
-        **{name: both(getattr(old, name), getattr(new, name)) for name in ("images", "depth", "depth_conf")},
-    )
-    return _with_views(scene, sorted(range(len(scene.names)), key=lambda view: by_number(scene.names[view])))
-
-
-def _with_views(scene: Scene, views: Sequence[int]) -> Scene:
-    """Returns the scene with some of its views; its Gaussians stay."""
-    rows = torch.tensor(views)
-    maps = {name: getattr(scene, name) for name in ("images", "depth", "depth_conf", "mask", "poses")}
-    return replace(
-        scene,
-        cameras=scene.cameras.select(rows.to(scene.cameras.world_to_camera.device)),
-        names=tuple(scene.names[view] for view in views),
-        pictures=(),
-        **{name: None if values is None else values[rows] for name, values in maps.items()},
-    )

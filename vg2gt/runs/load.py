@@ -26,7 +26,7 @@ from vg2gt.runs.checkpoints import (
     read_checkpoint,
     refuse_not_finite,
 )
-from vg2gt.runs.trust import check_targets, parse_run_config
+from vg2gt.runs.untrusted import check_targets, parse_run_config
 from vg2gt.uncertainty import Calibration, read_calibration
 
 log = logging.getLogger(__name__)
@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 SHIPPED = Path(__file__).resolve().parents[1] / "weights" / "sweep-tiny.safetensors"
 """Head trained on ``backend=sweep``; the package also contains that backend's weights, so no download is needed."""
 PARTS = ("backend", "model", "renderer")
-FREE = ("path", "pretrained", "revision", "head_chunk", "views_per_chunk")
+SAME_OUTPUT = ("path", "pretrained", "revision", "head_chunk", "views_per_chunk")
 """Keys that do not change what a network computes, or whose effect is covered by the hash of the weights."""
 TOKENS = ("taps", "reference_view", "given_poses")
 """Backend keys that change its outputs for the same weights; a trained part is valid for one choice only."""
@@ -105,7 +105,7 @@ def load_model(
         ImportError: if the backend needs a package that is not installed.
         ValueError: if a name or an option is unknown, or the checkpoint belongs to another backbone.
     """
-    checkpoint, parts = model_parts(ckpt, [*([f"backend={backend}"] if backend else []), *overrides])
+    checkpoint, parts = _model_parts(ckpt, [*([f"backend={backend}"] if backend else []), *overrides])
     try:
         built = build_model(parts, seed, choose_device(device))
         renderer: Renderer = instantiate(parts["renderer"])
@@ -121,7 +121,7 @@ def load_model(
     return LoadedModel(built, replace(renderer, mode="solid", depth="median"), weights, known)
 
 
-def model_parts(ckpt: str | Path | None, overrides: Sequence[str]) -> tuple[Path | None, dict[str, DictConfig]]:
+def _model_parts(ckpt: str | Path | None, overrides: Sequence[str]) -> tuple[Path | None, dict[str, DictConfig]]:
     """Returns the checkpoint and the configurations of backend, model and renderer for :func:`load_model`."""
     keys = [override.partition("=")[0].lstrip("+~") for override in overrides]
     for override, key in zip(overrides, keys, strict=True):
@@ -129,7 +129,7 @@ def model_parts(ckpt: str | Path | None, overrides: Sequence[str]) -> tuple[Path
             raise ValueError(f"option {override!r}: expected key=value with a key of {', '.join(PARTS)}")
     named = {key for key in keys if "." not in key}
     of_backend = [key.removeprefix("backend.") for key in keys if key.startswith("backend.")]
-    suits = "backend" not in named or ("backend=sweep" in overrides and all(key in FREE for key in of_backend))
+    suits = "backend" not in named or ("backend=sweep" in overrides and all(key in SAME_OUTPUT for key in of_backend))
     checkpoint = checkpoint_path(SHIPPED if ckpt is None and suits else ckpt)
     chosen = [override for override, key in zip(overrides, keys, strict=True) if key.partition(".")[0] in named]
     parts = resolve_parts(compose_groups(*chosen) if chosen else OmegaConf.create(), checkpoint)
@@ -154,7 +154,7 @@ def model_parts(ckpt: str | Path | None, overrides: Sequence[str]) -> tuple[Path
 def backend_class(ckpt: str | Path | None, overrides: Sequence[str]) -> type:
     """Returns the class of the backend that :func:`load_model` would build; ``object`` if it cannot be imported."""
     try:
-        return get_class(model_parts(ckpt, overrides)[1]["backend"]["_target_"])
+        return get_class(_model_parts(ckpt, overrides)[1]["backend"]["_target_"])
     except ImportError:
         return object
 
@@ -167,7 +167,7 @@ def resolve_parts(config: DictConfig, checkpoint: Path | None) -> dict[str, Dict
 
     Raises:
         ValueError: if the checkpoint stores no configuration, or another one decides its tokens.
-        UntrustedError: if it holds an interpolation or a target that is not allowed (:mod:`vg2gt.runs.trust`).
+        UntrustedError: if it holds an interpolation or a target that is not allowed (:mod:`vg2gt.runs.untrusted`).
     """
     given: dict[str, Any] = {part: config.get(part) for part in PARTS}
     parts = {part: value for part, value in given.items() if value is not None and "_target_" in value}
@@ -177,6 +177,7 @@ def resolve_parts(config: DictConfig, checkpoint: Path | None) -> dict[str, Dict
         learned = "backend" in parts and not parts["backend"]["_target_"].endswith("OracleBackend")
         model = ["model=tiny_ungated"] if learned else []
         run = compose("train", "output_dir=.", *model) if checkpoint is None else _config_of(checkpoint, missing)
+        OmegaConf.set_struct(run, False)  # +key=value gives arguments that the files leave at their default
         parts |= {part: OmegaConf.merge(run[part], given[part] or {}) for part in missing}
     if checkpoint is not None and given["backend"] is not None:
         refuse_other_tokens(parts["backend"], read_checkpoint(checkpoint), checkpoint)

@@ -78,10 +78,10 @@ def continuations(variants: Sequence[str], splits: Sequence[int], full_splits: i
     for count in splits:
         if count != full_splits and not (count == 1 and "wo_split" in variants):
             runs[f"splits={count}"] = (f"model.gaussians.splits={count}",)
-    return runs | ({CONTROL: ()} if any(map(has_new_layer, runs)) else {})
+    return runs | ({CONTROL: ()} if any(map(_has_new_layer, runs)) else {})
 
 
-def has_new_layer(name: str) -> bool:
+def _has_new_layer(name: str) -> bool:
     """Whether a run starts with a reinitialised last layer, by its name."""
     return name in (CONTROL, "wo_split") or name.startswith("splits=")
 
@@ -190,7 +190,7 @@ class Ablation:
         if CONTROL in self.results:
             parts += [
                 "## Differences to the full model with a new last layer, seed by seed",
-                _differences({name: runs for name, runs in self.results.items() if has_new_layer(name)}, CONTROL),
+                _differences({name: runs for name, runs in self.results.items() if _has_new_layer(name)}, CONTROL),
             ]
         return "\n\n".join(parts) + "\n"
 

@@ -19,7 +19,7 @@ from vg2gt.config import compose, flatten
 from vg2gt.evaluation.tables import Metric, markdown_table, number
 from vg2gt.io.files import read_json, write_json, write_text
 from vg2gt.runs.checkpoints import checkpoint_path, read_checkpoint, write_checkpoint
-from vg2gt.runs.trust import read_run_config
+from vg2gt.runs.untrusted import read_run_config
 from vg2gt.training.loop import build, evaluate, train
 from vg2gt.training.start import load_start
 

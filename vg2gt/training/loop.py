@@ -51,6 +51,15 @@ FEW_WORKERS = r"The '\w+_dataloader' does not have many workers"  # expected on 
 # Tensor sizes vary from step to step, which would fragment GPU memory. Read when CUDA initialises.
 ALLOCATOR = (f"PYTORCH_{'' if torch.__version__ >= '2.9' else 'CUDA_'}ALLOC_CONF", "expandable_segments:True")
 
+TRAINER = {
+    "max_epochs": -1,  # the number of steps ends a training
+    "check_val_every_n_epoch": None,  # val_check_interval counts steps
+    "num_sanity_val_steps": 0,
+    "enable_model_summary": False,
+    "use_distributed_sampler": False,  # our sampler gives each rank its own scenes
+}
+"""Lightning's options that follow from how we train; ``+trainer.KEY=VALUE`` changes them."""
+
 PRECISIONS = ("auto", "32-true", "bf16-mixed", "32", "bf16")  # the last two are Lightning's short names
 
 
@@ -102,6 +111,7 @@ def build(config: DictConfig) -> Run:
     module.made_of = made_of(config)
     trainer = instantiate(
         config.trainer,
+        **{key: value for key, value in TRAINER.items() if key not in config.trainer},
         accelerator=accelerator,
         precision=trainer_precision(str(config.trainer.precision), accelerator),
         callbacks=_callbacks(config),

@@ -22,7 +22,7 @@ from vg2gt.runs.checkpoints import (
     run_config_path,
 )
 from vg2gt.runs.load import RESUMED_IN_PLACE, earlier_configs, refuse_other_tokens
-from vg2gt.runs.trust import read_run_config
+from vg2gt.runs.untrusted import read_run_config
 from vg2gt.training.module import VG2GTModule
 
 IN_OPTIMIZER = ("training.part", "training.coarse_lr_factor", "training.backend_lr_factor", "backend.freeze")

@@ -46,8 +46,8 @@ class ViewerScene:
     antialiased: bool = RenderOptions.antialiased
 
     def initial(self) -> NamedCamera:
-        """Returns the initial view: the first camera, else :func:`default_camera`."""
-        return self.cameras[0] if self.cameras else default_camera(self.gaussians)
+        """Returns the initial view: the first camera, else :func:`_default_camera`."""
+        return self.cameras[0] if self.cameras else _default_camera(self.gaussians)
 
     def frustum_depth(self) -> float:
         """Returns the distance from a camera's centre to its drawn image, in scene units."""
@@ -55,7 +55,7 @@ class ViewerScene:
         return FRUSTUM_SHARE * scene_extent(self.gaussians.means.detach().cpu().double().numpy(), centers)
 
 
-def default_camera(gaussians: Gaussians) -> NamedCamera:
+def _default_camera(gaussians: Gaussians) -> NamedCamera:
     """Returns a view of a scene without cameras.
 
     This is the world frame if at least a tenth of the Gaussians are in view there. Otherwise the camera is placed in

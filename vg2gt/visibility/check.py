@@ -6,17 +6,19 @@ Other views see through a floater, and see a surface at the same place where the
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from vg2gt.geometry.cameras import compose, crop_intrinsics, focal_lengths, invert_rigid, unproject
+from vg2gt.geometry.cameras import compose, focal_lengths, invert_rigid, strided_intrinsics, unproject
 from vg2gt.types import Cameras, Geometry, TensorRecord
 from vg2gt.visibility.counts import count_views, depth_ratio
 
 STRIDE = 4  # pixels between samples of the disagreement, along each axis
 NEIGHBORS = 8  # partners per view for the disagreement
+LOOKED_AT = 32  # evenly spaced views whose disagreement is measured if there are MANY
 SAMPLES = 12  # pixels per side of the grid on which overlap is measured
 # Above MANY views, a view has MORE times as many partners, hidden points do not count, and near views count more.
 MANY, MORE = 100, 4
@@ -99,17 +101,56 @@ class ViewCheck:
         return Support(*(torch.stack(parts) for parts in zip(*scenes, strict=True)))
 
     def _check(self, depth: Tensor, cameras: Cameras, frames: Tensor | None) -> tuple[Tensor, Tensor]:
-        keep = depth > 0
         partners = choose_partners(depth, cameras, self.partners)
-        coarsen = (disagreement(depth, cameras, partners) / self.fine_below).clamp(1, self.coarsest)
-        for _ in range(self.rounds):
-            left = torch.where(keep, depth, 0.0)
-            counts = count_views(left, cameras, partners, self.tolerance, self.margin, weighted(len(depth)))
-            keep = keep & (counts.through <= counts.agree)
+        keep, spare = (torch.zeros_like(depth, dtype=torch.bool) for _ in range(2))
+        for _ in self.in_blocks(depth, cameras, partners, [slice(0, len(depth))], (keep, spare)):
+            pass
         if self.moment is not None and frames is not None:
             left = torch.where(keep, depth, 0.0)
             keep = keep & ~moved(left, cameras, partners, frames, self.moment, self.tolerance, self.moved_margin)
-        return keep, coarsen
+        return keep, self.coarsening(depth, cameras, partners)
+
+    @torch.no_grad()
+    def in_blocks(
+        self,
+        depth: Tensor,
+        cameras: Cameras,
+        partners: Tensor,
+        blocks: Sequence[slice],
+        masks: tuple[Tensor, Tensor],
+    ) -> Iterator[None]:
+        """Checks the depth of one scene, except for ``moment``; yields after each block.
+
+        Args:
+            depth: ``[V, H, W]`` z-depth, 0 = none; may be memory-mapped.
+            cameras: cameras of the views (B = 1).
+            partners: ``[V, K]`` from :func:`choose_partners`.
+            blocks: slices of views whose partners' depth fits in memory; together they cover all views.
+            masks: two buffers ``[V, H, W]``, overwritten; at the end the first is 1 for pixels that are kept, else 0.
+        """
+        before, after = masks
+        near_more = len(depth) > MANY  # near views count more (count_views)
+        for rows in blocks:
+            before[rows] = (depth[rows] > 0).to(before.dtype)
+        for _ in range(self.rounds):
+            for rows in blocks:
+                views, local = _neighbourhood(partners, torch.arange(rows.start, rows.stop, device=partners.device))
+                left = depth[views] * before[views]
+                counts = count_views(left, cameras.select(views), local, self.tolerance, self.margin, near_more)
+                inside = slice(0, rows.stop - rows.start)
+                kept = counts.through[inside] <= counts.agree[inside]
+                after[rows] = before[rows] * kept.to(before.dtype)
+                yield
+            before[:] = after
+
+    @torch.no_grad()
+    def coarsening(self, depth: Tensor, cameras: Cameras, partners: Tensor) -> Tensor:
+        """Returns the factor on the smallest voxel size, a scalar; arguments as for :meth:`in_blocks`."""
+        chosen = torch.arange(len(depth), device=partners.device)
+        if len(depth) > MANY:
+            chosen = torch.linspace(0, len(depth) - 1, LOOKED_AT, device=partners.device).round().long()
+        views, local = _neighbourhood(partners[:, :NEIGHBORS], chosen)
+        return (disagreement(depth[views], cameras.select(views), local) / self.fine_below).clamp(1, self.coarsest)
 
 
 @torch.no_grad()
@@ -149,9 +190,20 @@ def moved(
     return gone
 
 
-def weighted(views: int) -> bool:
-    """Returns whether near views count more in a scene with this many views (:func:`count_views`)."""
-    return views > MANY
+def _neighbourhood(partners: Tensor, views: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns the given views ``[m]`` followed by their partners ``[n]``, and the partners ``[n, K]`` as indices.
+
+    The added views have no partners themselves (-1).
+    """
+    if len(views) == len(partners):
+        return views, partners
+    named = partners[views].flatten()
+    chosen = torch.cat((views, named[(named >= 0) & ~torch.isin(named, views)].unique()))
+    place = partners.new_full((len(partners) + 1,), -1)
+    place[chosen] = torch.arange(len(chosen), device=place.device)  # index -1 reads the last entry, which stays -1
+    local = partners.new_full((len(chosen), partners.shape[1]), -1)
+    local[: len(views)] = place[partners[views]]
+    return chosen, local
 
 
 @torch.no_grad()
@@ -176,8 +228,7 @@ def depth_differences(depth: Tensor, cameras: Cameras, partners: Tensor) -> Tens
     """
     pose, intrinsics = cameras.world_to_camera[0].to(depth), cameras.intrinsics[0].to(depth)
     sampled = depth[:, STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE]
-    shifted = crop_intrinsics(intrinsics, STRIDE // 2, STRIDE // 2)
-    strided = torch.cat((shifted[:, :2] / STRIDE, shifted[:, 2:]), 1)
+    strided = strided_intrinsics(intrinsics, STRIDE, STRIDE)
     to_world = invert_rigid(pose)
     size = (sampled.shape[1], sampled.shape[2])
     local = Cameras(torch.eye(4).to(depth).repeat(1, len(depth), 1, 1), strided[None], size)
@@ -216,8 +267,7 @@ def choose_partners(depth: Tensor, cameras: Cameras, most: int) -> Tensor:
     rows, columns = slice(step[0] // 2, None, step[0]), slice(step[1] // 2, None, step[1])
     sampled = depth[:, rows, columns].double()
     pose, intrinsics = cameras.world_to_camera[0].double(), cameras.intrinsics[0].double()
-    shifted = crop_intrinsics(intrinsics, step[1] // 2, step[0] // 2)
-    strided = torch.cat((shifted[:, :1] / step[1], shifted[:, 1:2] / step[0], shifted[:, 2:]), 1)
+    strided = strided_intrinsics(intrinsics, step[1], step[0])
     small = Cameras(pose[None], strided[None], (sampled.shape[1], sampled.shape[2]))
     points = unproject(sampled[None], small)[0].flatten(1, 2)  # [V, P, 3]
     known = (sampled > 0).flatten(1)  # [V, P]

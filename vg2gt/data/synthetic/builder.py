@@ -15,7 +15,7 @@ Vector = Sequence[float]  # x, y, z
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
 
 
-def yaw_rotation(angle: float) -> NDArray[np.float64]:
+def _yaw_rotation(angle: float) -> NDArray[np.float64]:
     """Returns the 3x3 rotation by ``angle`` (rad) about the vertical."""
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -47,7 +47,7 @@ class Builder:
         """Sets the coordinate frame of the following parts and starts a new group."""
         self.end_group()
         self._origin = position
-        self._rotation = yaw_rotation(yaw)
+        self._rotation = _yaw_rotation(yaw)
 
     def end_group(self) -> None:
         """Closes the current group if it has parts. The parts of a group should be close together."""
@@ -70,7 +70,7 @@ class Builder:
 
     def box(self, center: Vector, size: Vector, material: int, turn: float = 0.0, tilt: float = 0.0) -> None:
         """Adds a box with edge lengths ``size``, turned about the vertical and tilted about its x axis (rad)."""
-        self._add(BOX, center, np.array(size) / 2, material, yaw_rotation(turn) @ _tilt_rotation(tilt))
+        self._add(BOX, center, np.array(size) / 2, material, _yaw_rotation(turn) @ _tilt_rotation(tilt))
 
     def cylinder(self, center: Vector, radius: float, height: float, material: int, lying: bool = False) -> None:
         """Adds a cylinder, upright or with its axis along y."""

@@ -111,7 +111,7 @@ def _workspace(world: World, samples: int) -> tuple[tuple[NDArray, ...], ...]:
 
 
 @part
-def add_sky(sky, d, angle, color):
+def _add_sky(sky, d, angle, color):
     """Adds the linear colour of the sky in unit direction ``d`` to ``color``; ``angle`` is the pixel width (rad)."""
     height = max(d[2], 0.0)
     blend = math.sqrt(height)
@@ -186,7 +186,7 @@ def _shade(hit, t, p, d, footprint, parts, look, highlights, sky, shadowing, cou
     shallow = 0.15
     if sky is not None:
         if hit < 0 and hit != GROUND:
-            add_sky(sky, d, footprint, color)
+            _add_sky(sky, d, footprint, color)
             return
         shallow = 0.03  # otherwise the far ground would flicker
     nx, ny, nz, u, v = surface(hit, parts, p[0], p[1], p[2])

@@ -36,7 +36,7 @@ _MIN_WIDTH = 1e-4  # filter width below which a pattern counts as unfiltered
 
 
 @part
-def hash_cell(x, y, seed):
+def _hash_cell(x, y, seed):
     """Returns a pseudo-random number in [0, 1) for an integer lattice cell."""
     h = (x * 0x27D4EB2D + y * 0x165667B1 + seed * 0x9E3779B1) & 0xFFFFFFFF
     h = ((h ^ (h >> 15)) * 0x2C1B3C6D) & 0xFFFFFFFF
@@ -56,13 +56,13 @@ def _blend_cells(x, y, seed, width):
     v = min(max((y - iy - 0.5) / width + 0.5, 0.0), 1.0)
     i = int(ix)
     j = int(iy)
-    low = hash_cell(i, j, seed) * (1 - u) + hash_cell(i + 1, j, seed) * u
-    high = hash_cell(i, j + 1, seed) * (1 - u) + hash_cell(i + 1, j + 1, seed) * u
+    low = _hash_cell(i, j, seed) * (1 - u) + _hash_cell(i + 1, j, seed) * u
+    high = _hash_cell(i, j + 1, seed) * (1 - u) + _hash_cell(i + 1, j + 1, seed) * u
     return low * (1 - v) + high * v
 
 
 @part
-def value_noise(x, y, seed):
+def _value_noise(x, y, seed):
     """Returns smooth noise in [-1, 1] with unit lattice spacing."""
     ix = math.floor(x)
     iy = math.floor(y)
@@ -72,8 +72,8 @@ def value_noise(x, y, seed):
     v = v * v * (3 - 2 * v)
     i = int(ix)
     j = int(iy)
-    low = hash_cell(i, j, seed) * (1 - u) + hash_cell(i + 1, j, seed) * u
-    high = hash_cell(i, j + 1, seed) * (1 - u) + hash_cell(i + 1, j + 1, seed) * u
+    low = _hash_cell(i, j, seed) * (1 - u) + _hash_cell(i + 1, j, seed) * u
+    high = _hash_cell(i, j + 1, seed) * (1 - u) + _hash_cell(i + 1, j + 1, seed) * u
     return 2 * (low * (1 - v) + high * v) - 1
 
 
@@ -87,7 +87,7 @@ def fractal_noise(x, y, frequency, octaves, footprint, seed):
         damping = math.exp(-width * width)
         if damping < 0.03:
             break
-        total += amplitude * damping * value_noise(x * frequency, y * frequency, seed + octave)
+        total += amplitude * damping * _value_noise(x * frequency, y * frequency, seed + octave)
         amplitude *= 0.6
         frequency *= 2.1
     return total
@@ -153,7 +153,7 @@ def pattern_value(kind, x, y, frequency, footprint, seed):
         row = math.floor(2 * v)
         shifted = u + 0.5 * (row - 2 * math.floor(0.5 * row))
         mortar = 1 - (1 - pulse_train(shifted, 0.05, width)) * (1 - pulse_train(2 * v, 0.1, 2 * width))
-        tone = hash_cell(math.floor(shifted), int(row), seed)
+        tone = _hash_cell(math.floor(shifted), int(row), seed)
         fade = min(max(2.0 - 4.0 * width, 0.0), 1.0)
         value = (1 - mortar) * (0.5 + fade * 0.8 * (tone - 0.5))
     elif kind == DOTS:
@@ -170,13 +170,13 @@ def pattern_value(kind, x, y, frequency, footprint, seed):
     elif kind == PLANKS:
         board = math.floor(v)
         fade = min(max(2.0 - 4.0 * width, 0.0), 1.0)
-        tone = hash_cell(int(board), 7, seed) * fade + 0.5 * (1 - fade)
+        tone = _hash_cell(int(board), 7, seed) * fade + 0.5 * (1 - fade)
         grain = _grain(x + 10 * tone, y, frequency * 2.0, footprint, seed)
         value = (1 - pulse_train(v, 0.06, width)) * (0.6 * tone + 0.4 * grain)
     elif kind == WINDOWS:
         pane = pulse_train(u, 0.5, width) * pulse_train(v, 0.55, width)
         bars = 1 - 0.5 * pulse_train(2 * u, 0.08, 2 * width)
-        tone = hash_cell(math.floor(u + 0.5), math.floor(v + 0.5), seed)
+        tone = _hash_cell(math.floor(u + 0.5), math.floor(v + 0.5), seed)
         fade = min(max(2.0 - 4.0 * width, 0.0), 1.0)
         value = pane * bars * (0.75 + fade * 0.5 * (tone - 0.5))
     return min(max(value, 0.0), 1.0)

@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from vg2gt.kernels.point_moments import moments_in_one_pass
+from vg2gt.kernels.moments import moments_in_one_pass
 from vg2gt.kernels.threads import compilable
 from vg2gt.method.grid import VoxelPlan, pool_mean_of_chunks
 
-Moments = tuple[Tensor, Tensor, Tensor, Tensor]
+COLUMNS = (18, 3, 1)  # products of position and (position, colour), camera centre, side of a pixel
 
 
 @torch.no_grad()
@@ -25,7 +25,7 @@ def pool_point_moments(
     means: Tensor,
     plan: VoxelPlan,
     views_per_chunk: int,
-) -> Moments:
+) -> Tensor:
     """Confidence-weighted second moments in every voxel, without gradient; compiled for float32 on a CPU.
 
     Args:
@@ -38,8 +38,8 @@ def pool_point_moments(
         views_per_chunk: views at a time where it is not compiled; bounds the memory.
 
     Returns:
-        Covariances ``[M, 3, 3]`` of position and ``[M, 3 (position), 3 (colour)]`` of position and colour, mean camera
-        centre ``[M, 3]``, and mean side ``[M]`` of a pixel at the points' depth, in cells.
+        ``[M, 22]`` (:data:`COLUMNS`): covariances ``[3 (position), 6 (position, colour)]``, mean camera centre ``[3]``
+        and mean side of a pixel at the points' depth, in cells.
     """
     per_view = len(values) // len(views)
     centers = F.pad(means, (0, 0, 0, 1))  # [M + 1, 6]; the last for points in no voxel
@@ -53,9 +53,5 @@ def pool_point_moments(
 
     chunks = (products(first) for first in range(0, len(views), views_per_chunk))
     if compilable(values, depth, confidence, views, means):
-        found = moments_in_one_pass(values, depth, confidence, views, means, plan.order, plan.starts, plan.counts)
-    else:
-        found = pool_mean_of_chunks(chunks, confidence, plan)
-    both, eye, pixel = found.split((18, 3, 1), -1)
-    spread, cross = both.unflatten(-1, (3, 6)).split(3, -1)
-    return spread, cross, eye, pixel[:, 0]
+        return moments_in_one_pass(values, depth, confidence, views, means, plan.order, plan.starts, plan.counts)
+    return pool_mean_of_chunks(chunks, confidence, plan)

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from vg2gt.geometry.symmetric import FULL, UPPER, smallest_eigenvector
+from vg2gt.kernels.spread import spread_around
 from vg2gt.kernels.threads import compilable, over_voxels
-from vg2gt.kernels.voxel_normals import spread_around
 from vg2gt.method.grid import VoxelPlan, mixed_radix_keys
 
 FACING_PRIOR = 1e-4  # cells^2; without evidence, a surface faces its cameras

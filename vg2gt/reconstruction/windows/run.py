@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
 
 import torch
 from torch import Tensor
 
-from vg2gt.data.sources.masks import mask_beside
-from vg2gt.geometry.cameras import crop_intrinsics, scale_translations
+from vg2gt.geometry.cameras import scale_translations, strided_intrinsics
 from vg2gt.geometry.precision import half_precision_on_gpu
 from vg2gt.inputs.inputs import thumbnails, working_order
 from vg2gt.inputs.pictures import Picture
-from vg2gt.io.files import write_json
-from vg2gt.io.tensors import read_tensors
-from vg2gt.memory import note_sizes
-from vg2gt.method.fine import FineModule
-from vg2gt.method.grid import scene_voxel_size
+from vg2gt.method.pooled import PooledVoxels
 from vg2gt.model import VG2GT, Reconstructor, background_sums
 from vg2gt.monitor import Monitor
 from vg2gt.reconstruction.windows.placement import (
@@ -32,20 +25,8 @@ from vg2gt.reconstruction.windows.placement import (
     place_windows,
     seen_from,
 )
-from vg2gt.reconstruction.windows.store import (
-    ANCHOR,
-    SET,
-    Anchor,
-    Capture,
-    Window,
-    WindowStore,
-    cut,
-    finished_sets,
-    key_of,
-    merge_windows,
-)
+from vg2gt.reconstruction.windows.store import Capture, Window, WindowStore, cut, merge_windows, remove, set_key
 from vg2gt.types import Cameras, Gaussians, Geometry, Tokens
-from vg2gt.visibility.blocks import check_blocks, coarsening
 from vg2gt.visibility.check import choose_partners
 
 TOKEN_BYTES = 4e9  # maximum size of all windows' tokens on disk; if larger, the backbone runs a second time instead
@@ -61,7 +42,7 @@ def window_model(model: Reconstructor) -> VG2GT:
     """
     if model.visibility is not None and model.visibility.moment is not None:
         raise ValueError("motion detection needs all views at once: add --window 0 or model.visibility.moment=null")
-    if isinstance(model, VG2GT) and isinstance(model.fine, FineModule):
+    if isinstance(model, VG2GT):
         return model
     raise ValueError(f"{type(model).__name__} reconstructs all views at once: add --window 0, or take fewer views")
 
@@ -81,7 +62,6 @@ class WindowRun:
         window: maximum number of own views per window.
         folder: folder for finished steps, from which an interrupted run resumes.
         monitor: shows the progress.
-        anchor: anchor of the scene to add the pictures to; None: make a new scene.
     """
 
     def __init__(
@@ -92,14 +72,10 @@ class WindowRun:
         window: int,
         folder: Path,
         monitor: Monitor,
-        anchor: Anchor | None = None,
     ) -> None:
-        self.model, self.monitor, self.count, self.folder = model, monitor, len(pictures), folder
-        self.anchor = anchor
-        self.fine = cast(FineModule, model.fine)
-        self.device = device_of(model)
-        self.store = WindowStore(folder, set_key(model, pictures, size, window, anchor))
-        self.capture = Capture(self.store, pictures, size, monitor, None if anchor is None else anchor.shift)
+        self.model, self.monitor, self.count, self.device = model, monitor, len(pictures), device_of(model)
+        self.store = WindowStore(folder, set_key(model, pictures, size, window))
+        self.capture = Capture(self.store, pictures, size, monitor)
         self.windows = cut(len(pictures), window)
         self.blocks = [each.own for each in self.windows]
         shape = (self.count, *size)
@@ -108,36 +84,24 @@ class WindowRun:
 
     def geometry_and_gaussians(self) -> tuple[Geometry, Gaussians, Tensor]:
         """Returns the geometry of all views, with depth only where the scene uses it, the Gaussians, and the unit."""
-        surveyed, anchor = self.survey(), self.anchor
+        surveyed = self.survey()
         cameras, scales = self._placement(surveyed)
         # windows' units to the cameras' unit: [V, H, W]
         metres = torch.cat([each["scale"] for each in surveyed]) / scales[[rows.start for rows in self.blocks]]
         for rows in self.blocks:
             self.depth[rows] = self.raw[rows] * scales[rows, None, None]
-        if anchor is None:
-            reference = cameras.world_to_camera[0, working_order(self.capture.images)[0]]
-        else:
-            reference = torch.from_numpy(anchor.reference)
+        reference = cameras.world_to_camera[0, working_order(self.capture.images)[0]]
         # the cameras' frame and unit to the scene's
         geometry = Geometry(self.depth[None], self.conf[None], seen_from(reference, cameras), metres.median()[None])
-        unit = self.model.scale(_sampled(geometry), None) if anchor is None else torch.tensor([anchor.unit])
+        unit = self.model.scale(_sampled(geometry), None)
         for rows in self.blocks:
             self.depth[rows] *= unit
         geometry = replace(geometry, cameras=scale_translations(geometry.cameras, unit), scale=geometry.scale / unit)
         # visibility check, fine voxels of each window, Gaussians of all windows
         size = self._check(geometry)
-        if anchor is None:
-            numbers, model = (float(unit), float(size)), key_of(self.model)
-            anchor = Anchor(reference.double().numpy(), *numbers, self.capture.size, model, self.capture.shift)
-            for other in finished_sets(self.folder):
-                if other != self.store.folder:
-                    shutil.rmtree(other)
-            write_json(self.folder / ANCHOR, anchor.plain())
-        self.anchor = anchor
-        self._pool(geometry, torch.tensor([anchor.voxel_size]))
-        write_json(self.store.folder / SET, {"finished": True})
-        geometry = replace(geometry, cameras=geometry.cameras.to(self.device))
-        return geometry, gaussians_of(self.model, self.folder, anchor, self.monitor), unit
+        gaussians = self._finish(self._pool(geometry, size), size)
+        remove(self.store.folder.parent, but=self.store.folder)
+        return replace(geometry, cameras=geometry.cameras.to(self.device)), gaussians, unit
 
     def survey(self) -> list[dict[str, Tensor]]:
         """Computes the depth of all views in their windows' units; returns what is needed to place each window."""
@@ -223,22 +187,20 @@ class WindowRun:
 
     def _check(self, geometry: Geometry) -> Tensor:
         """Removes depth that other views contradict; returns the edge of the fine voxels ``[1]``."""
-        check, coarsen, fine = self.model.visibility, None, self.fine
+        check, coarsen = self.model.visibility, None
         if check is not None:
             masks = (self.store.array("kept", self.depth.shape), self.store.array("kept_next", self.depth.shape))
             with self.monitor.stage("views check views", check.rounds * len(self.windows)) as advance:
                 partners = choose_partners(self.depth, geometry.cameras, check.partners)
-                coarsen = coarsening(check, self.depth, geometry.cameras, partners)
-                for _ in check_blocks(check, self.depth, geometry.cameras, partners, self.blocks, masks):
+                coarsen = check.coarsening(self.depth, geometry.cameras, partners)[None]
+                for _ in check.in_blocks(self.depth, geometry.cameras, partners, self.blocks, masks):
                     advance()
             for rows in self.blocks:
                 self.depth[rows] *= masks[0][rows]
-        return scene_voxel_size(_sampled(geometry), fine.voxel_size, fine.min_footprint, coarsen)
+        return self.model.fine.voxel_edges(_sampled(geometry), coarsen)
 
-    def _pool(self, geometry: Geometry, size: Tensor) -> None:
-        sums = [background_sums(self.capture.images[None, rows], self.raw[None, rows]) for rows in self.blocks]
-        total, weight = (torch.stack(parts).sum(0) for parts in zip(*sums, strict=True))
-        self.store.save("background", {"total": total, "weight": weight})
+    def _pool(self, geometry: Geometry, size: Tensor) -> PooledVoxels:
+        """Returns the fine voxels ``[M]`` of all windows."""
         with self.monitor.stage("fine voxels", len(self.windows)) as advance:
             for number, window in enumerate(self.windows):
                 name = f"voxels-{number:06d}"
@@ -250,62 +212,19 @@ class WindowRun:
                         geometry.scale.to(self.device),
                     )
                     images = self.capture.images[None, window.own].to(self.device)
+                    tokens = self._tokens(number, window)
                     with half_precision_on_gpu(images):
-                        pooled = self.fine.pool(self._tokens(number, window), part, images, size.to(self.device))
+                        pooled = self.model.fine.pool(tokens, part, images, size.to(self.device), capped=False)
                     self.store.save(name, {key: value for key, value in vars(pooled).items() if value is not None})
                 advance()
+        return merge_windows(self.store.files("voxels"), self.monitor)
 
-
-@torch.no_grad()
-def gaussians_of(
-    model: VG2GT, folder: Path, anchor: Anchor, monitor: Monitor, left_out: Path | None = None
-) -> Gaussians:
-    """Returns the Gaussians of all finished sets in a folder.
-
-    The same sets give bit-identical Gaussians, even if others were added and removed in between.
-
-    Args:
-        model: model that pooled the voxels.
-        folder: parent folder of the sets.
-        anchor: anchor of the scene.
-        monitor: shows the progress.
-        left_out: folder of a set to leave out.
-
-    Raises:
-        ValueError: if there are no voxels.
-    """
-    sets = [place for place in finished_sets(folder) if place != left_out]
-    files = [file for place in sets for file in sorted(place.glob("voxels-*"))]
-    pooled = merge_windows(files, monitor)
-    device = device_of(model)
-    note_sizes({"voxels": len(pooled)})
-    with monitor.stage("Gaussians"), half_precision_on_gpu(torch.empty(0, device=device)):
-        voxels = cast(FineModule, model.fine).refine(
-            pooled.to(device), torch.tensor([anchor.voxel_size], device=device)
-        )
-        gaussians = model.gaussians(voxels)
-    if model.background == "black":
-        return gaussians
-    sums = [read_tensors(place / "background.safetensors") for place in sets]
-    total, weight = (torch.stack([each[name] for each in sums]).sum(0) for name in ("total", "weight"))
-    return replace(gaussians, background=(total / weight).to(device))
-
-
-def set_key(
-    model: VG2GT, pictures: Sequence[Picture], size: tuple[int, int], window: int, anchor: Anchor | None = None
-) -> str:
-    """Returns the key of a set of pictures for this model, working and window size, and anchor of a scene."""
-    return key_of(model, [_facts(each) for each in pictures], size, window, None if anchor is None else anchor.plain())
-
-
-def _facts(picture: Picture) -> list[Any]:
-    """Returns what identifies a picture's content and camera, as JSON values."""
-    path = picture.path
-    files = [path, None if path is None else mask_beside(path), picture.container]
-    states = [file.stat() for file in files if file is not None]
-    matrices = [None if each is None else each.tolist() for each in (picture.pose, picture.intrinsics)]
-    stamps = [[state.st_size, state.st_mtime_ns] for state in states]
-    return [picture.name, picture.size, picture.source, picture.lens, matrices, stamps]
+    def _finish(self, pooled: PooledVoxels, size: Tensor) -> Gaussians:
+        sums = [background_sums(self.capture.images[None, rows], self.raw[None, rows]) for rows in self.blocks]
+        total, weight = (torch.stack(parts).sum(0) for parts in zip(*sums, strict=True))
+        with self.monitor.stage("Gaussians"), half_precision_on_gpu(torch.empty(0, device=self.device)):
+            pooled = self.model.fine.limited(pooled.to(self.device))
+            return self.model.finish(pooled, size.to(self.device), (total, weight))[1]
 
 
 def _summary(views: Tensor, tokens: Tokens, geometry: Geometry) -> dict[str, Tensor]:
@@ -326,8 +245,7 @@ def _summary(views: Tensor, tokens: Tokens, geometry: Geometry) -> dict[str, Ten
 def found_of(known: dict[str, Tensor]) -> Found:
     """Returns a window's cameras and reduced depth from its summary."""
     size = (known["depth"].shape[1], known["depth"].shape[2])
-    shifted = crop_intrinsics(known["intrinsics"], REDUCED // 2, REDUCED // 2)
-    sampled = torch.cat((shifted[..., :2, :] / REDUCED, shifted[..., 2:, :]), -2)
+    sampled = strided_intrinsics(known["intrinsics"], REDUCED, REDUCED)
     return Found(known["views"], Cameras(known["poses"], sampled, size), known["depth"], known["intrinsics"])
 
 

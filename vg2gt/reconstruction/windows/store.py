@@ -17,26 +17,24 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.lib.format import open_memmap
-from numpy.typing import NDArray
 from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from vg2gt.data.sources.masks import mask_beside
 from vg2gt.inputs.inputs import depth_range, given_poses, load_views, map_shift, source_of
 from vg2gt.inputs.pictures import Picture
 from vg2gt.io.errors import FormatError
-from vg2gt.io.files import read_json, replacing, write_json
+from vg2gt.io.files import replacing, write_json
 from vg2gt.io.tensors import read_tensors
 from vg2gt.method.pooled import PooledVoxels, concatenate, merge
 from vg2gt.model import Reconstructor
 from vg2gt.monitor import Monitor
 from vg2gt.types import Cameras, Hints
 
-FORMAT = 2
+FORMAT = 3
 """Version of the folder's format; increment it when the format changes."""
-SET = "set.json"  # marks the folder of a set; says whether it is finished
-ANCHOR = "scene.json"
-_KEPT = ("voxels-", "background", SET)  # prefixes of the files that a finished set needs
+SET = "set.json"  # marks the folder of a set
 ROWS = 400_000  # voxels merged at a time
 AUTOMATIC = 100  # number of views above which a capture is processed in windows
 SIZE = 24  # own views per window
@@ -56,7 +54,7 @@ class WindowStore:
     def __init__(self, folder: Path, key: str) -> None:
         self.folder = folder / key[:12]
         if not (self.folder / SET).is_file():
-            write_json(self.folder / SET, {"finished": False})
+            write_json(self.folder / SET, {})
 
     def array(self, name: str, shape: Sequence[int] | None = None, fill: float = 0) -> Tensor:
         """Returns a memory-mapped float32 array of the folder; writing to the tensor writes to the file.
@@ -79,6 +77,10 @@ class WindowStore:
         """Returns whether an array or a finished step of this name exists."""
         return any((self.folder / f"{name}.{suffix}").is_file() for suffix in ("npy", "safetensors"))
 
+    def files(self, prefix: str) -> list[Path]:
+        """Returns the files of all finished steps whose names begin with ``prefix``, in order."""
+        return sorted(self.folder.glob(f"{prefix}-*.safetensors"))
+
     def save(self, name: str, tensors: Mapping[str, Tensor]) -> None:
         """Writes the result of a step, completely or not at all."""
         with replacing(self.folder / f"{name}.safetensors") as temporary:
@@ -92,9 +94,10 @@ class WindowStore:
             return None
 
 
-def key_of(model: Reconstructor, *facts: object) -> str:
-    """Returns a hash of a model's weights and options, and of further facts (JSON values)."""
-    digest = hashlib.sha256(json.dumps([FORMAT, model.backend.identity(), facts]).encode())
+def set_key(model: Reconstructor, pictures: Sequence[Picture], size: tuple[int, int], window: int) -> str:
+    """Returns a hash of the model's weights and options, the pictures, and the working and window size."""
+    facts = [FORMAT, model.backend.identity(), [_facts(each) for each in pictures], size, window]
+    digest = hashlib.sha256(json.dumps(facts).encode())
     for name, module in model.named_modules():
         options = {key: value for key, value in vars(module).items() if isinstance(value, _PLAIN) and key[0] != "_"}
         options.pop("training", None)
@@ -104,6 +107,16 @@ def key_of(model: Reconstructor, *facts: object) -> str:
         digest.update(name.encode())
         digest.update(tensor.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes())
     return digest.hexdigest()
+
+
+def _facts(picture: Picture) -> list[Any]:
+    """Returns what identifies a picture's content and camera, as JSON values."""
+    path = picture.path
+    files = [path, None if path is None else mask_beside(path), picture.container]
+    states = [file.stat() for file in files if file is not None]
+    matrices = [None if each is None else each.tolist() for each in (picture.pose, picture.intrinsics)]
+    stamps = [[state.st_size, state.st_mtime_ns] for state in states]
+    return [picture.name, picture.size, picture.source, picture.lens, matrices, stamps]
 
 
 def merge_windows(files: Sequence[Path], monitor: Monitor, limit: int = ROWS) -> PooledVoxels:
@@ -152,89 +165,13 @@ def _read_rows(file: Path, rows: slice) -> dict[str, Tensor]:
         return {key: opened.get_slice(key)[rows] for key in opened.keys()}  # noqa: SIM118
 
 
-@dataclass(frozen=True)
-class Anchor:
-    """Data shared by all sets of a scene; created with the first set.
-
-    Attributes:
-        reference: ``[4, 4]`` float64 pose of the camera that is the frame of the voxels, in the shifted world.
-        unit: scene units per unit of the given cameras.
-        voxel_size: edge of the fine voxels in scene units.
-        size: ``(height, width)`` of the images.
-        model: key of the model.
-        shift: ``[4, 4]`` float64 translation from the shifted world to that of the given cameras (:func:`map_shift`).
-    """
-
-    reference: NDArray[np.float64]
-    unit: float
-    voxel_size: float
-    size: tuple[int, int]
-    model: str
-    shift: NDArray[np.float64]
-
-    @property
-    def to_source(self) -> NDArray[np.float64]:
-        """``[4, 4]`` similarity from the frame and unit of the voxels to those of the given cameras."""
-        return self.shift @ np.linalg.inv(self.reference) @ np.diag([*[1 / self.unit] * 3, 1.0])
-
-    def plain(self) -> dict[str, Any]:
-        """Returns the attributes as JSON values."""
-        return vars(self) | {"reference": self.reference.tolist(), "shift": self.shift.tolist()}
-
-
-def read_anchor(folder: Path) -> Anchor:
-    """Reads the anchor of a scene.
-
-    Raises:
-        FileNotFoundError: if there is none; the message names the remedy.
-        ValueError: if an earlier version wrote it.
-    """
-    if not (folder / ANCHOR).is_file():
-        raise FileNotFoundError(
-            f"{folder} contains no voxels of a scene: reconstruct it with --window N --keep-windows and given cameras"
-        )
-    found: dict[str, Any] = read_json(folder / ANCHOR)
-    if "shift" not in found:
-        raise ValueError(f"{folder} was written by an earlier version: reconstruct the scene again")
-    found.update({name: np.array(found[name]) for name in ("reference", "shift")}, size=tuple(found["size"]))
-    return Anchor(**found)
-
-
-def finished_sets(folder: Path) -> list[Path]:
-    """Returns the folders of the complete sets, sorted by key, which is the order of summation."""
-    return sorted(path.parent for path in folder.glob(f"*/{SET}") if read_json(path).get("finished"))
-
-
-def mark_taken_out(place: Path) -> None:
-    """Marks a set as no part of the scene; :func:`tidy` removes it, once the scene without it is written."""
-    write_json(place / SET, {"finished": False, "taken_out": True})
-
-
-def was_taken_out(place: Path) -> bool:
-    """Returns whether a set is marked by :func:`mark_taken_out`."""
-    return (place / SET).is_file() and bool(read_json(place / SET).get("taken_out"))
-
-
-def remove(folder: Path) -> None:
-    """Removes all sets of a folder and the anchor, and the folder if it is empty then."""
-    sets = list(folder.glob(f"*/{SET}"))
-    for file in sets:
-        shutil.rmtree(file.parent)
-    if sets:
-        (folder / ANCHOR).unlink(missing_ok=True)
-        if not any(folder.iterdir()):
-            folder.rmdir()
-
-
-def tidy(folder: Path) -> None:
-    """Removes unfinished sets and all files that are not needed to add or remove sets."""
-    done = finished_sets(folder)
-    for place in (file.parent for file in folder.glob(f"*/{SET}")):
-        if place not in done:
-            shutil.rmtree(place)
-    for file in (file for place in done for file in place.iterdir()):
-        if not file.name.startswith(_KEPT):
-            file.unlink()
+def remove(folder: Path, but: Path | None = None) -> None:
+    """Removes all sets of a folder, except for that in the folder ``but``; also the folder if it is empty then."""
+    sets = [file.parent for file in folder.glob(f"*/{SET}") if file.parent != but]
+    for place in sets:
+        shutil.rmtree(place)
+    if sets and not any(folder.iterdir()):
+        folder.rmdir()
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,21 +193,18 @@ class Window:
         return slice(first, first + self.own.stop - self.own.start)
 
 
-def window_size(asked: int | None, views: int, kept: bool = False) -> int:
+def window_size(asked: int | None, views: int) -> int:
     """Returns the number of own views per window; 0: all views at once.
 
     Args:
         asked: requested number; None: automatic.
         views: number of views.
-        kept: always use windows, because their voxels are kept.
 
     Raises:
         ValueError: if ``asked`` is below 4 and not 0.
     """
     if asked is not None and asked != 0 and asked < 4:
         raise ValueError(f"window must be at least 4 views, or 0 for all views at once, got {asked}")
-    if kept:
-        return min(asked or SIZE, views)
     size = asked if asked is not None else SIZE if views > AUTOMATIC else 0
     return size if 0 < size < views else 0
 
@@ -294,7 +228,6 @@ class Capture:
         pictures: source pictures, one per view.
         size: ``(height, width)`` of the images.
         monitor: shows the progress.
-        shift: see :class:`Anchor`; None: that of these pictures.
 
     Attributes:
         images: ``[V, 3, H, W]``, memory-mapped.
@@ -311,7 +244,6 @@ class Capture:
         pictures: Sequence[Picture],
         size: tuple[int, int],
         monitor: Monitor,
-        shift: NDArray[np.float64] | None = None,
     ) -> None:
         self.pictures, self.store, self.size, count = pictures, store, size, len(pictures)
         self._source = source_of(pictures)
@@ -329,9 +261,8 @@ class Capture:
         self.mask = store.array("mask") if store.has("mask") else None
         self._depth = store.array("given_depth") if store.has("given_depth") else None
         self.given: Cameras | None = None
-        self.shift = map_shift(pictures) if shift is None else shift
         if self._source:
-            self.given = Cameras(given_poses(pictures, self.shift)[None], torch.cat(intrinsics)[None], size)
+            self.given = Cameras(given_poses(pictures, map_shift(pictures))[None], torch.cat(intrinsics)[None], size)
 
     def _read(self, rows: slice, size: tuple[int, int]) -> dict[str, Tensor]:
         views = load_views(self.pictures[rows], size, Monitor())

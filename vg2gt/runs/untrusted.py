@@ -29,12 +29,6 @@ OWN = ("vg2gt", "backends")
 KINDS = (nn.Module, SceneSource, SceneScale, ViewCheck, Renderer)
 """Classes of this project that a run's file may name, besides data modules; their constructors at most read files."""
 
-GONE = ("background", "compile", "drift", "provider")
-"""Options that our backends had in former versions; no network depends on them."""
-
-MOVED = {"vg2gt.method.additions.visibility.": "vg2gt.visibility."}
-"""Former places of classes that runs of former versions name."""
-
 
 class UntrustedError(ValueError):
     """An untrusted file asks for more than data."""
@@ -56,8 +50,6 @@ def read_run_config(path: str | Path) -> DictConfig:
 
 def parse_run_config(text: str, source: str | Path) -> DictConfig:
     """Parses an untrusted configuration; ``source`` names it in errors, which are those of :func:`read_run_config`."""
-    for former, now in MOVED.items():
-        text = text.replace(former, now)
     if "${" in text:  # an interpolation could read the environment
         raise UntrustedError(f"{source} holds an interpolation; a run's configuration must contain plain values only")
     try:
@@ -66,16 +58,7 @@ def parse_run_config(text: str, source: str | Path) -> DictConfig:
         raise ValueError(f"{source} is not a run's configuration: {' '.join(str(error).split())}") from error
     if not isinstance(content, dict):
         raise ValueError(f"{source} is not a run's configuration: expected a mapping")
-    if "backend" in content:
-        content["backend"] = _without_gone(content["backend"])
     return OmegaConf.create(content)
-
-
-def _without_gone(part: Any) -> Any:
-    if not isinstance(part, dict):
-        return part
-    gone = GONE if str(part.get("_target_")).startswith("backends.") else ()
-    return {key: _without_gone(value) for key, value in part.items() if key not in gone}
 
 
 def check_targets(config: Any, source: str | Path) -> None:
