@@ -33,7 +33,7 @@ from vg2gt.reconstruction.trust import pixel_trust
 from vg2gt.reconstruction.windows.run import WindowRun, device_of, window_model
 from vg2gt.reconstruction.windows.store import window_size
 from vg2gt.rendering import Renderer
-from vg2gt.types import Gaussians, Geometry
+from vg2gt.types import Cameras, Gaussians, Geometry
 from vg2gt.uncertainty import Calibration
 
 log = logging.getLogger(__name__)
