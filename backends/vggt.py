@@ -189,6 +189,7 @@ class VGGTBackend(NetworkBackend):
     """
 
     camera_name = "camera_head"
+    encoder_name = "aggregator"
     network: _VGGTNetwork
 
     def __init__(

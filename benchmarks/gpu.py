@@ -1,14 +1,15 @@
 """Measurements on a GPU, in about eight minutes: ``python benchmarks/gpu.py [--parts NAME ...]``.
 
 Parts: forward and backward pass of the renderer (``render``), training steps of ``experiment=paper`` with random
-weights, by stage, and the device hours of a training of the paper's length (``step``), ``reconstruct`` with 50 images
-(``reconstruct``), and ``pytest -m gpu`` (``tests``). After every measurement it writes
-``<date>-gpu-<part>.json`` to ``--out`` (default: the variable OUT, or benchmarks/results), so that partial results are
-kept. ``--small`` makes all sizes tiny, also for a CPU.
+weights, by stage, and the device hours of a training of the paper's length (``step``), trainings on the same scenes
+with one GPU and all (``ddp``), ``reconstruct`` with 50 images (``reconstruct``), and ``pytest -m gpu`` (``tests``).
+After every measurement it writes ``<date>-gpu-<part>.json`` to ``--out`` (default: the variable OUT, or
+benchmarks/results), so that partial results are kept. ``--small`` makes all sizes tiny, also for a CPU.
 """
 
 from __future__ import annotations
 
+import csv
 import gc
 import os
 import subprocess
@@ -36,6 +37,7 @@ ROOT = Path(__file__).resolve().parents[1]
 Result = dict[str, Any]
 LINES = 25  # lines of output and profile to keep
 PAPER_STEPS, PAPER_DEVICES = 420_000, 2
+DDP_STEPS = (10, 30)  # lengths of two trainings, whose difference is without start and evaluations
 
 
 @dataclass(frozen=True)
@@ -125,6 +127,48 @@ def _step(setting: Setting, views: int, size: tuple[int, int], overrides: Sequen
     yield {"profile": found.key_averages().table(sort_by=kind, row_limit=LINES).splitlines()}
 
 
+def ddp(setting: Setting) -> Iterator[Result]:
+    """Trainings on one device and on all, with as many scenes per step: time per step, and how far losses differ.
+
+    The first steps have equal weights up to the order of sums; later ones also differ by what rounding has grown to.
+    """
+    count = 2 if setting.small else torch.cuda.device_count()
+    if count < 2:
+        yield {"skipped": "needs several GPUs"}
+        return
+    curves = []
+    for devices in (1, count):
+        seconds, curve = zip(*(_train(setting, devices, count, steps) for steps in DDP_STEPS), strict=True)
+        curves.append(curve[-1])
+        milliseconds = 1e3 * (seconds[1] - seconds[0]) / (DDP_STEPS[1] - DDP_STEPS[0])
+        yield {f"{devices} devices, {count} scenes": {"ms": milliseconds, "losses": curve[-1]}}
+    apart = [abs(one - several) / abs(one) for one, several in zip(*curves, strict=True)]
+    yield {"relative difference of the losses": apart}
+
+
+def _train(setting: Setting, devices: int, scenes: int, steps: int) -> tuple[float, list[float]]:
+    """Seconds and losses of ``train.py experiment=paper`` with that many scenes per step, over all devices."""
+    views, size = (2, "[28,56]") if setting.small else (8, "[224,448]")
+    tiny = ["backend=da3_tiny", "model=tiny", "trainer.accelerator=cpu"]
+    overrides = tiny if setting.small else ["backend=da3_large", "backend.pretrained=false"]
+    overrides += [f"data.image_size={size}", f"data.min_views={views}", f"data.max_views={views}"]
+    overrides += [f"data.max_images={views * scenes // devices}", f"data.train_scenes={2 * scenes}"]
+    overrides += ["data.eval_scenes=1", "model.coarse.ptv3.drop_path=0", "optimizer.lr=1e-5", "training.final_lr=1e-5"]
+    overrides += [f"trainer.devices={devices}", f"trainer.max_steps={steps}", "trainer.log_every_n_steps=1"]
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, str(ROOT / "train.py"), "experiment=paper", "data=synthetic", *overrides]
+        begin = time.monotonic()
+        ended = subprocess.run(
+            [*command, f"output_dir={folder}"], cwd=ROOT, capture_output=True, text=True, check=False
+        )
+        seconds = time.monotonic() - begin
+        if ended.returncode:
+            raise RuntimeError(f"train.py ended with status {ended.returncode}: {ended.stderr[-1000:]}")
+        (path,) = Path(folder).glob("logs/*/metrics.csv")
+        with path.open() as file:
+            return seconds, [float(row["loss"]) for row in csv.DictReader(file) if row["loss"]]
+
+
 def reconstruct(setting: Setting) -> Iterator[Result]:
     """Reconstruction of 10 and 50 images with the paper's model and random weights, and rendering of all views."""
     backend, model, size = ("da3_tiny", "tiny", (28, 56)) if setting.small else ("da3_large", "vg2gt", (224, 448))
@@ -165,6 +209,7 @@ def tests(setting: Setting) -> Iterator[Result]:
 PARTS: dict[str, Callable[[Setting], Iterator[Result]]] = {
     "render": render,
     "step": step,
+    "ddp": ddp,
     "reconstruct": reconstruct,
     "tests": tests,
 }

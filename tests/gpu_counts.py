@@ -110,8 +110,9 @@ class Operations(TorchDispatchMode):
 @contextmanager
 def as_on_a_gpu() -> Iterator[None]:
     """Makes a CPU run the code paths of a GPU inside the block, except Triton kernels."""
+    from vg2gt.kernels import knn
     from vg2gt.losses import gaussian, geometry
-    from vg2gt.method import fine, knn, sparse_conv
+    from vg2gt.method import fine, sparse_conv
     from vg2gt.method.additions import voxel_normals
 
     changes: list[tuple[Any, str, Any]] = [

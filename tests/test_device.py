@@ -15,8 +15,8 @@ from torch import Tensor
 from tests.reliability.steps import TINY, first_batches
 from tests.training_helpers import NARROW, small_config
 from vg2gt.evaluation.in_training import evaluate_scene
-from vg2gt.kernels import curve_codes
-from vg2gt.method import fine, knn, sparse_conv
+from vg2gt.kernels import curve_codes, knn
+from vg2gt.method import fine, sparse_conv
 from vg2gt.method.additions import voxel_normals
 from vg2gt.profiling import listening
 from vg2gt.reconstruction.pipeline import reconstruct_with

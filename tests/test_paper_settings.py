@@ -50,6 +50,7 @@ STATED: dict[str, tuple[Any, int, str]] = {
     "training.part": ("all", 267, "train only the proposed differentiable multi-scale voxel module"),
     "training.render_views": (None, 284, "rendered RGB images"),
     "training.rasterized_depth": (False, 218, "we replace standard 3DGS rasterization"),
+    "images": (420_000 * 2 * 18, 295, "420K iterations"),
     "trainer.devices": (2, 295, "two NVIDIA RTX PRO 6000 GPUs"),
     "trainer.max_steps": (420000, 295, "420K iterations"),
 }
@@ -70,9 +71,9 @@ BOOKKEEPING = (
 )  # fmt: skip
 
 
-def _settings() -> dict[str, Any]:
-    """Keys of the files, and the defaults of those that no file sets."""
-    config: Any = OmegaConf.to_container(compose("train", "experiment=paper"))
+def _settings(experiment: str = "paper") -> dict[str, Any]:
+    fixed = ("name=paper", "output_dir=unused")
+    config: Any = OmegaConf.to_container(compose("train", f"experiment={experiment}", *fixed), resolve=True)
 
     def walk(branch: dict[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
         for key, value in (DEFAULTS.get(branch.get("_target_", ""), {}) | branch).items():
@@ -103,13 +104,20 @@ def test_every_setting_has_a_source() -> None:
 
 
 def test_the_table_names_what_there_is() -> None:
-    """No option in it is gone, and ``experiment=paper`` takes the paper's side of every key marked ``*``."""
+    """No option in it is gone, and the experiments take the paper's side of the keys that the page says they do."""
     settings, text = _settings(), TABLE.read_text()
     options = re.findall(r"`((?:backend|model|data|loss|renderer|optimizer|training|trainer)\.[a-z0-9_.]+)`", text)
     assert not [row for row in options if not any(key.startswith(row) for key in settings)]
-    marked = dict(re.findall(r"`([a-z0-9_.]+)`\* \(`([^`]+)`\)", text))
+    marked = {key: yaml.safe_load(value) for key, value in re.findall(r"`([a-z0-9_.]+)`\* \(`([^`]+)`\)", text)}
     assert len(marked) > 10
-    assert {key: settings[key] for key in marked} == {key: yaml.safe_load(value) for key, value in marked.items()}
+    assert {key: settings[key] for key in marked} == marked
+    pairs = re.findall(r"`([a-z0-9_.]+)`\*? \(`([^`]+)`\)", text)
+    assert len(pairs) == text.count("(`")  # the page's brackets hold nothing else
+    bracketed = {key: yaml.safe_load(value) for key, value in pairs}
+    literal = _settings("paper_literal")
+    assert {key: literal[key] for key in bracketed} == bracketed
+    changed = {key for key in settings.keys() & literal.keys() if settings[key] != literal[key]}
+    assert changed <= bracketed.keys()
 
 
 @pytest.mark.skipif(not PAPER.is_file(), reason=f"needs {PAPER.name}")

@@ -14,7 +14,36 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+
+def _images_per_step(config: DictConfig) -> int:
+    """Images that all devices of a training together read in a step, at most."""
+    trainer, devices = config.trainer, str(config.trainer.devices).strip("[]")
+    if devices in ("-1", "auto"):
+        import torch
+
+        count = 1 if trainer.accelerator == "cpu" else max(1, torch.cuda.device_count())
+    else:
+        count = len(devices.split(",")) if "," in devices or "[" in str(trainer.devices) else int(devices)
+    return int(config.data.max_images) * count * int(trainer.get("num_nodes", 1))
+
+
+def _steps_for(images: int, *, _root_: DictConfig) -> int:
+    """``${steps_for:IMAGES}``: the number of steps that read so many images, on any number of devices."""
+    return round(images / _images_per_step(_root_))
+
+
+def _rate_for(rate: float, images: int, *, _root_: DictConfig) -> float:
+    """``${rate_for:RATE,IMAGES}``: a learning rate for steps of so many images, scaled by the root of the number.
+
+    Adam's updates have the size of the rate whatever the batch, while the noise of their mean falls with its root
+    (Malladi et al., On the SDEs and Scaling Rules for Adaptive Gradient Algorithms, 2022).
+    """
+    return rate * (_images_per_step(_root_) / images) ** 0.5
+
+
 OmegaConf.register_new_resolver("last_part", lambda path: Path(str(path)).name, replace=True)
+OmegaConf.register_new_resolver("steps_for", _steps_for, replace=True)
+OmegaConf.register_new_resolver("rate_for", _rate_for, replace=True)
 
 _PACKAGE = Path(__file__).resolve().parent
 ENTRY_POINTS = {"backend": "vg2gt.backends", "data": "vg2gt.datasets"}

@@ -1,15 +1,62 @@
 import pytest
 import torch
 from hydra.errors import InstantiationException
+from torch.utils._python_dispatch import TorchDispatchMode
 
+import backends.da3.backend
+import backends.network
+import backends.vggt
 from backends.da3.backend import normalize_cameras
 from backends.da3.metric import fit_scale
 from vg2gt.geometry.cameras import invert_rigid, relative_to_first
-from vg2gt.types import Cameras, Geometry, Hints
+from vg2gt.types import Cameras, Geometry, Hints, Tokens
 
 SIZE = (56, 84)
 HEADS = ("pretrained=false", "dim=48", "num_heads=3", "features=24", "out_channels=[16,20,28,32]", "image_size=70")
 TINY_METRIC = (*HEADS, "depth=4", "taps=[0,1,2,3]")
+
+
+class Casts(TorchDispatchMode):
+    """Counts copies of weights to bfloat16."""
+
+    def __init__(self, network: torch.nn.Module) -> None:
+        super().__init__()
+        self.weights = {parameter.data_ptr() for parameter in network.parameters()}
+        self.count = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        if func.overloadpacket.__name__ == "_to_copy" and (kwargs or {}).get("dtype") == torch.bfloat16:
+            self.count += args[0].data_ptr() in self.weights
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("name", ["da3_tiny", "vggt_tiny"])
+def test_frozen_weights_are_stored_as_autocast_takes_them(name: str, make_backend, make_scene, monkeypatch) -> None:
+    """On a GPU; here autocast of the CPU is made to take its place. Equal to the bit, and no cast in any later pass."""
+    images, _ = make_scene(1, 2, SIZE)
+    backend = make_backend(name)
+    exact, weights = backend.encode(images), backend.identity()
+
+    def encode() -> tuple[Tokens, int]:
+        with Casts(backend.network) as casts:
+            return backend.encode(images), casts.count
+
+    def half(like: torch.Tensor) -> torch.autocast:
+        return torch.autocast("cpu", torch.bfloat16)
+
+    for module in (backends.da3.backend, backends.vggt):
+        monkeypatch.setattr(module, "half_precision_on_gpu", half)
+    expected, before = encode()
+    monkeypatch.setattr(backends.network, "half_precision_on_gpu", half)
+    backend.encode(images)
+    found, after = encode()
+    assert (before > 20, after) == (True, 0)
+    assert all(map(torch.equal, found.patch, expected.patch))
+    assert torch.equal(found.camera, expected.camera)
+    assert backend.identity() == weights
+    monkeypatch.undo()
+    torch.testing.assert_close(backend.encode(images).patch, exact.patch, rtol=0.05, atol=0.05)  # rounded weights
+    backend.decode(found)  # the heads stay float32
 
 
 @pytest.mark.parametrize("views", [2, 4])

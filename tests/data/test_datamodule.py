@@ -1,6 +1,7 @@
 """Batches for training and evaluation, and the same batches after a resume."""
 
 from functools import partial
+from types import SimpleNamespace
 
 import lightning
 import pytest
@@ -36,6 +37,26 @@ def test_evaluation_batches_are_context_then_targets(rooms):
     assert [batch.scene for batch in batches] == [("room-000100",), ("room-000101",)]
     assert (batches[0].frame_ids.tolist(), batches[0].num_context) == ([[0, 2, 4, 1, 3]], 3)
     assert batches[0].target.frame_ids.tolist() == [[1, 3]]
+
+
+def test_the_limit_of_evaluated_windows_is_that_of_all_devices_together(rooms):
+    long = SyntheticScenes(3, first_seed=100, num_frames=200, size=SIZE)
+    options = {"val": long, "eval_context": 1, "eval_target": 1, "eval_window": 2}
+
+    def evaluated(devices: int, **more) -> list:
+        module = module_of(rooms, **options, **more)
+        found = []
+        for rank in range(devices):
+            strategy = SimpleNamespace(root_device=torch.device("cpu"))
+            module.trainer = SimpleNamespace(global_rank=rank, world_size=devices, strategy=strategy)
+            found += [(views.scene, *views.context) for (views,) in module.val_dataloader().sampler]
+        return sorted(found)
+
+    whole, one = evaluated(1), evaluated(1, eval_samples=40)
+    assert len(whole) == len(set(whole)) == 300
+    assert (len(one), one[0], one[-1]) == (40, whole[0], whole[-1])
+    assert {scene for scene, _ in one} == set(long.scenes)
+    assert evaluated(2, eval_samples=40) == evaluated(8, eval_samples=40) == one
 
 
 def test_training_and_evaluation_on_the_same_scenes_is_refused(rooms):

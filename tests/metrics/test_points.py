@@ -1,7 +1,9 @@
-import numpy as np
+import math
+
 import pytest
 import torch
 
+from vg2gt.kernels import knn
 from vg2gt.metrics import cv, point_metrics
 from vg2gt.metrics.points import thin
 
@@ -30,7 +32,7 @@ def test_matches_brute_force(cap: float | None) -> None:
 
 
 def test_thinning_keeps_one_point_per_cell() -> None:
-    points = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.6, 0, 0], [0.0, 0.6, 0], [0.05, 0.05, 0.05]])
+    points = torch.tensor([[0.0, 0, 0], [0.1, 0, 0], [0.6, 0, 0], [0.0, 0.6, 0], [0.05, 0.05, 0.05]])
     assert thin(points, 0.5).tolist() == points[[0, 2, 3]].tolist()
     dense = torch.cat((cloud(50, 0), cloud(50, 0) + 1e-6))
     assert point_metrics(dense, cloud(50, 0), 0.1, downsample=1e-3)["accuracy"] < 1e-6
@@ -51,3 +53,15 @@ def test_a_draw_of_queries_is_seeded_and_searches_the_whole_cloud() -> None:
     # Thinning the cloud itself would lengthen all distances and change the figure's meaning.
     assert drawn == pytest.approx(full, rel=0.1)
     assert cv(points, max_queries=4000) == full
+
+
+@pytest.mark.parametrize("compiled", [True, False], ids=["tree", "cells"])
+def test_a_cloud_in_one_place_or_with_a_hole_has_no_uniformity(compiled: bool, monkeypatch) -> None:
+    """The search is by a tree on a CPU, and by cells on a GPU."""
+    points = cloud(200, 0).float()
+    expected = cv(points)
+    monkeypatch.setattr(knn, "compilable", lambda *_: compiled)
+    assert cv(points) == pytest.approx(expected, rel=1e-12)
+    assert math.isnan(cv(points[:8]))
+    assert math.isnan(cv(torch.ones_like(points)))
+    assert math.isnan(cv(torch.cat((points, points[:1] * math.nan))))

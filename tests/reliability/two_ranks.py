@@ -1,5 +1,8 @@
-"""Scenarios on two processes, several after one another on the same two."""
+"""Scenarios on two or more processes, several after one another on the same ones."""
 
+import functools
+import os
+import signal
 import socket
 import time
 from collections.abc import Callable, Sequence
@@ -10,16 +13,21 @@ from unittest.mock import patch
 
 import lightning
 import torch
+from lightning.fabric.utilities.rank_zero import rank_zero_only
+from omegaconf import open_dict
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
+from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from tests.commands import ROOT, become, warm_process
-from tests.reliability.degenerate import SCENES
-from tests.reliability.steps import first_batches, fit, tiny_run
+from tests.reliability.degenerate import SCENES, beside
+from tests.reliability.steps import TINY, first_batches, fit, tiny_run
+from tests.training_helpers import small_config
 from vg2gt.data import DataError
 from vg2gt.data.batches import BatchDataset
+from vg2gt.data.views.sampling import StepSampler
 from vg2gt.training.distributed import ending_together
-from vg2gt.training.loop import Run, evaluate
+from vg2gt.training.loop import Run, evaluate, train
 
 RANKS = ["trainer=ddp", "trainer.accelerator=cpu"]
 SGD = ["optimizer=adamw", "optimizer._target_=torch.optim.SGD", "~optimizer.betas", "optimizer.lr=0.05"]
@@ -85,6 +93,85 @@ def faulty_rank(folder: Path, cache: Path) -> dict[str, Any]:
     return {"weights": weights(run), "dropped": audit.skipped, "faults": run.module.skipped.state_dict()["faults"]}
 
 
+PROVEN = {"frozen": ["backend=da3_tiny"], "trained": ["backend=da3_tiny", "backend.freeze=false"]}
+VARYING = ["data.min_views=2", "data.max_views=4", "data.max_images=4", "data.train_scenes=6"]
+ON_RANK_1 = ["unchanged", "no depth", "black images", "held-out view looks away", "unchanged", "one pixel with depth"]
+
+
+class Steps(lightning.Callback):
+    """Keeps the weights before every step, its loss, and its gradient after all ranks have averaged it.
+
+    Args:
+        given: weights to set before every step, so that a step's rounding does not reach the next; None: as trained.
+    """
+
+    def __init__(self, given: Sequence[Tensor] | None = None) -> None:
+        self.given = given
+        self.weights: list[Tensor] = []
+        self.gradients: list[Tensor] = []
+        self.losses: list[float] = []
+
+    def on_train_batch_start(self, trainer: lightning.Trainer, pl_module: Any, *args: Any) -> None:
+        parameters = pl_module.model.trained_parameters()
+        if self.given is not None:
+            vector_to_parameters(self.given[len(self.weights)].clone(), parameters)
+        self.weights.append(parameters_to_vector(parameters).detach().clone())
+
+    def on_before_optimizer_step(self, trainer: lightning.Trainer, pl_module: Any, optimizer: Any) -> None:
+        self.gradients.append(torch.cat([p.grad.flatten().clone() for p in pl_module.model.trained_parameters()]))
+
+    def on_train_batch_end(self, trainer: lightning.Trainer, *args: Any) -> None:
+        self.losses.append(float(trainer.callback_metrics["loss"]))
+
+
+def step_by_step(
+    folder: Path, cache: Path, overrides: Sequence[str], ranks: Sequence[int], given: Sequence[Tensor] | None = None
+) -> dict[str, Any]:
+    """Trains on the batches that some of two ranks draw; those of rank 1 are changed by :data:`ON_RANK_1`."""
+    run = tiny_run(folder, cache, "optimizer=adamw", *VARYING, *overrides)
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():  # away from the zero convolutions
+        for parameter in run.module.model.trained_parameters():
+            parameter += 0.02 * torch.randn(parameter.shape, generator=generator)
+    run.datamodule.setup("fit")
+    data = run.datamodule._train
+    scenes, views = run.datamodule._train_names, run.datamodule.sampler
+    samplers = [StepSampler(data.source, scenes, views, 100, rank=rank, world_size=2) for rank in ranks]
+    batches = []
+    for step, change in enumerate(ON_RANK_1):
+        of_ranks = [data[sampler.step(step)] for sampler in samplers]
+        changed = [SCENES[change](batch) if rank else batch for rank, batch in zip(ranks, of_ranks, strict=True)]
+        batches.append(functools.reduce(beside, changed))
+    steps = Steps(given)
+    run.trainer.callbacks.append(steps)  # pyright: ignore[reportAttributeAccessIssue]
+    audit = fit(run, batches)
+    assert not any(audit.skipped)
+    return {**vars(steps), "views": [batch.num_context for batch in batches]}
+
+
+class KilledAt(lightning.Callback):
+    """Kills a rank in a step that no checkpoint follows."""
+
+    def __init__(self, step: int, rank: int) -> None:
+        self.step, self.rank = step, rank
+
+    def on_train_batch_start(self, trainer: lightning.Trainer, *args: Any) -> None:
+        if (trainer.global_step, trainer.global_rank) == (self.step, self.rank):
+            os.kill(os.getpid(), signal.SIGKILL)
+
+
+def whole_run(folder: Path, cache: Path, killed: bool = False) -> dict[str, Any]:
+    """Trains six steps with a checkpoint after every second one, or goes on; rank 1 is killed in the fourth."""
+    kept = [override for override in TINY if not override.startswith("callbacks.")]
+    overrides = [*kept, *VARYING, *RANKS, "ckpt=auto", "trainer.max_steps=6", "backend=da3_tiny"]
+    config = small_config(folder, cache, *overrides)
+    if killed:
+        with open_dict(config):
+            config.callbacks.kill = {"_target_": f"{__name__}.KilledAt", "step": 3, "rank": 1}
+    rank_zero_only.rank = own_rank()  # Lightning read it when it was imported, before this process had one
+    return {"steps": train(config)["steps"]}
+
+
 def three_scenes(folder: Path, cache: Path, *overrides: str) -> dict[str, Any]:
     """Evaluates three scenes, the second of them without depth."""
     run = tiny_run(folder, cache, "data.eval_scenes=3", *overrides)
@@ -96,6 +183,20 @@ def three_scenes(folder: Path, cache: Path, *overrides: str) -> dict[str, Any]:
 
     with patch.object(BatchDataset, "__getitem__", without_depth):
         return evaluate(run)
+
+
+WINDOWS = [
+    "data.num_frames=60",
+    "data.eval_scenes=10",
+    "data.eval_window=2",
+    "data.eval_context=1",
+    "data.eval_target=1",
+]
+
+
+def windows(folder: Path, cache: Path, *overrides: str) -> dict[str, Any]:
+    """Evaluates 300 windows of ten scenes."""
+    return evaluate(tiny_run(folder, cache, *WINDOWS, *overrides))
 
 
 def one_scene(folder: Path, cache: Path, *overrides: str) -> dict[str, Any]:
@@ -130,25 +231,35 @@ SCENARIOS: dict[str, Callable[[Path, Path], dict[str, Any]]] = {
     "three_scenes": lambda folder, cache: three_scenes(folder, cache, *RANKS),
     "one_scene": lambda folder, cache: one_scene(folder, cache, *RANKS),
     "broken_loader": broken_loader,
+    **{
+        name: lambda folder, cache, more=more: step_by_step(folder, cache, [*RANKS, *more], [own_rank()])
+        for name, more in PROVEN.items()
+    },
+    "whole": whole_run,
+    "killed": lambda folder, cache: whole_run(folder.with_name("interrupted"), cache, killed=True),
+    "resumed": lambda folder, cache: whole_run(folder.with_name("interrupted"), cache),
+    "windows": lambda folder, cache: windows(folder, cache, *RANKS, f"trainer.devices={os.environ['WORLD_SIZE']}"),
 }
 
 
-def run_on_two_ranks(folder: Path, cache: Path, *names: str, timeout: float = 900) -> list[CompletedProcess[str]]:
+def run_on_ranks(
+    folder: Path, cache: Path, *names: str, ranks: int = 2, timeout: float = 900
+) -> list[CompletedProcess[str]]:
     """Runs scenarios after one another; their results are ``FOLDER/<name>-<rank>.pt``, errors end a rank."""
-    address = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port()), "NODE_RANK": "0", "WORLD_SIZE": "2"}
-    said = [folder / f"said-{rank}.txt" for rank in range(2)]
-    ranks = [
+    address = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port()), "NODE_RANK": "0", "WORLD_SIZE": str(ranks)}
+    said = [folder / f"said-{rank}.txt" for rank in range(ranks)]
+    processes = [
         warm_process(_run_rank, folder, cache, names, path, address | {"LOCAL_RANK": str(rank)})
         for rank, path in enumerate(said)
     ]
     end = time.monotonic() + timeout
     try:
-        for rank in ranks:
-            rank.join(max(0, end - time.monotonic()))
-        codes = [rank.exitcode for rank in ranks]
+        for process in processes:
+            process.join(max(0, end - time.monotonic()))
+        codes = [process.exitcode for process in processes]
     finally:
-        for rank in ranks:
-            rank.kill()
+        for process in processes:
+            process.kill()
     if None in codes:
         raise TimeoutExpired(names, timeout)
     return [CompletedProcess(names, code, stderr=path.read_text()) for code, path in zip(codes, said, strict=True)]
@@ -159,6 +270,10 @@ def _run_rank(folder: Path, cache: Path, names: Sequence[str], said: Path, envir
     for name in names:
         result = SCENARIOS[name](folder / name, cache)
         torch.save(result, folder / f"{name}-{environment['LOCAL_RANK']}.pt")
+
+
+def own_rank() -> int:
+    return int(os.environ["LOCAL_RANK"])
 
 
 def free_port() -> int:

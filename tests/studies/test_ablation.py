@@ -200,12 +200,15 @@ def test_given_weights_on_a_protocol(finished: Path, tmp_path: Path, cache: Path
         report = json.loads((tmp_path / "seed-0" / run / "synthetic" / "metrics.json").read_text())
         mean = report["views"]["2"]["mean"]
         assert some.results[run][0]["psnr"] == mean["rendered/gt_pose/solid/psnr"]
+        assert some.results[run][0]["context/psnr"] == mean["rendered/context/solid/psnr"]
         assert some.results[run][0]["gaussians"] == mean["scene/gaussians"]
         weights = read_checkpoint(newest(tmp_path / "seed-0" / run / "checkpoints"))["state_dict"]
         kept = read_checkpoint(given)["state_dict"]
         assert torch.equal(weights["model.gaussians.hidden.weight"], kept["model.gaussians.hidden.weight"])
     assert some.results["wo_split"][0]["gaussians"] < 0.7 * some.results[FULL][0]["gaussians"]
     assert "as in vg2gt evaluate evaluation=synthetic views=2" in some.report()
+    shown = some.results["wo_split"][0]["context/psnr"]
+    assert f"| w/o Split, context | {shown:.2f} |" in unpadded(some.report())
     assert f"Full model 0 steps from {given}, then every row" in some.report()
     with pytest.raises(ValueError, match=r"protocol_overrides: views=\[3, 10\].*give one number"):
         study(tmp_path, cache, **own, protocol_overrides=["views=[3,10]"])

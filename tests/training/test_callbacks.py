@@ -2,6 +2,7 @@
 
 import csv
 import multiprocessing
+import os
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -10,8 +11,9 @@ from typing import Any
 import lightning
 import pytest
 from lightning.pytorch.callbacks import LambdaCallback
+from omegaconf import open_dict
 
-from tests.reliability.crash_harness import RUN
+from tests.reliability.crash_harness import RUN, STEPS
 from tests.training_helpers import small_config
 from vg2gt.runs.checkpoints import newest, read_checkpoint
 from vg2gt.training.distributed import ending_together
@@ -85,6 +87,39 @@ def test_a_signal_ends_an_evaluation_at_once(tmp_path: Path, cache: Path) -> Non
     run.trainer.validate(run.module, datamodule=run.datamodule, verbose=False)
     signal.signal(signal.SIGTERM, before)
     assert handlers == [signal.SIG_DFL]
+
+
+def test_slurms_notice_during_an_evaluation_leaves_the_requeueing_to_the_job(tmp_path, cache, monkeypatch) -> None:
+    """In the environment of a SLURM job, with a stand-in for the command with which Lightning would requeue it."""
+    asked = tmp_path / "requeued"
+    stand_in = tmp_path / "bin" / "scontrol"
+    stand_in.parent.mkdir()
+    stand_in.write_text(f"#!/bin/sh\necho $* >> {asked}\n")
+    stand_in.chmod(0o755)
+    monkeypatch.setenv("PATH", str(stand_in.parent), prepend=os.pathsep)
+    for name, value in {"JOB_ID": "4242", "JOB_NAME": "train", "NTASKS": "1", "PROCID": "0", "NODEID": "0"}.items():
+        monkeypatch.setenv(f"SLURM_{name}", value)
+    config = small_config(tmp_path / "run", cache, *RUN, "ckpt=auto")
+    with open_dict(config):
+        config.callbacks.notice = {"_target_": f"{__name__}.NoticeOnce", "given": str(tmp_path / "given")}
+    with pytest.raises(SystemExit) as left:
+        train(config)
+    assert left.value.code == 0
+    assert not asked.exists()
+    assert not list((tmp_path / "run").rglob("*.ckpt"))
+    assert train(config)["steps"] == STEPS
+
+
+class NoticeOnce(lightning.Callback):
+    """SLURM's notice in the first evaluation; ``given`` is the file that says so."""
+
+    def __init__(self, given: str) -> None:
+        self.given = Path(given)
+
+    def on_validation_batch_start(self, *args: Any) -> None:
+        if not self.given.exists():
+            self.given.touch()
+            signal.raise_signal(signal.SIGUSR1)
 
 
 def test_a_killed_process_that_loads_data_is_one_error(tmp_path: Path, cache: Path) -> None:

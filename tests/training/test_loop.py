@@ -112,6 +112,8 @@ REFUSED: list[tuple[list[str], str | None]] = [
         (["overwrite=true", override], message)
         for override, message in {
             "data.workers=-1": r"data\.workers=-1 must be at least 0",
+            "data.eval_samples=0": r"data\.eval_samples=0 must be at least 1",
+            "trainer.limit_val_batches=40": r"limit_val_batches=40 counts per device.*use data\.eval_samples",
             "data.eval_scenes=0": r"data\.eval_scenes=0 must be at least 1",
             "optimizer.lr=-1": r"optimizer: Invalid learning rate: -1",
             "optimizer.lr=0": r"optimizer\.lr=0.*a positive number",

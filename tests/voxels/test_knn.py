@@ -2,8 +2,8 @@ import pytest
 import torch
 from scipy.spatial import KDTree
 
-from vg2gt.method import knn
-from vg2gt.method.knn import interpolate, interpolation_weights, nearest_by_cells
+from vg2gt.kernels import knn
+from vg2gt.kernels.knn import interpolate, interpolation_weights, nearest_by_cells
 
 
 @pytest.fixture(params=["trees", "cells"], autouse=True)

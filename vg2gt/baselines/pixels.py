@@ -13,7 +13,7 @@ from torch import Tensor
 from backends.base import Backend
 from vg2gt.geometry.cameras import invert_rigid, ray_directions
 from vg2gt.geometry.spherical_harmonics import rgb_to_sh, rotation_of_coefficients
-from vg2gt.method.knn import nearest_in_scenes
+from vg2gt.kernels.knn import nearest_in_scenes
 from vg2gt.model import Background, Reconstructor, SceneScale, background_sums
 from vg2gt.profiling import stage
 from vg2gt.types import Gaussians, Geometry, Hints, Prediction, TensorRecord, Tokens, check_choice

@@ -18,7 +18,7 @@ from vg2gt.data.base import SceneSource, SourceMaker, made
 from vg2gt.data.batches import BatchDataset
 from vg2gt.data.overlap import refuse_overlap, refuse_untrainable
 from vg2gt.data.transforms import resize_to_cover
-from vg2gt.data.views.even import EvaluationViews
+from vg2gt.data.views.even import EvaluationViews, spread
 from vg2gt.data.views.sampling import StepSampler, ViewSampler, usable_scenes
 from vg2gt.types import Batch
 
@@ -52,6 +52,8 @@ class SceneDataModule(LightningDataModule):
         eval_context: positions or number of the evaluation's input views (``EvaluationViews``).
         eval_target: positions or number of the evaluation's held-out views.
         eval_window: evaluate long scenes in stretches of this many frames; None: the whole scene at once.
+        eval_samples: evaluate at most this many scenes or stretches, spread evenly over all, in total and not per
+            device, so that metrics do not depend on the number of devices; None: all.
         steps_per_epoch: training steps per epoch.
         seed: seeds the sampling of scenes and views.
         workers: loader processes; 0 decodes in the training process; None: as many as cores and memory allow when
@@ -79,6 +81,7 @@ class SceneDataModule(LightningDataModule):
         eval_context: int | Sequence[int] = 8,
         eval_target: int | Sequence[int] = 3,
         eval_window: int | None = None,
+        eval_samples: int | None = None,
         steps_per_epoch: int = 1000,
         seed: int = 0,
         workers: int | None = None,
@@ -87,7 +90,8 @@ class SceneDataModule(LightningDataModule):
     ) -> None:
         super().__init__()
         limits = {"train_scenes": (train_scenes, 1), "eval_scenes": (eval_scenes, 1), "workers": (workers, 0)}
-        for name, (value, least) in (limits | {"memory_mb": (memory_mb, 0)}).items():
+        limits |= {"eval_samples": (eval_samples, 1), "memory_mb": (memory_mb, 0)}
+        for name, (value, least) in limits.items():
             if value is not None and value < least:
                 raise ValueError(f"data.{name}={value} must be at least {least}")
         self.sampler = ViewSampler(min_views, max_views, max_images, expand_ratio, target_views, seed, view_sets)
@@ -97,6 +101,7 @@ class SceneDataModule(LightningDataModule):
         self.common = common
         self.train_scenes = train_scenes
         self.eval_scenes = eval_scenes
+        self.eval_samples = eval_samples
         self.steps_per_epoch = steps_per_epoch
         self.workers = workers
         self.memory_mb = memory_mb
@@ -121,7 +126,8 @@ class SceneDataModule(LightningDataModule):
         refuse_untrainable(train)
         self._train_names = usable_scenes(train, self.sampler, self.train_scenes)
         names = list(val.scenes)[: self.eval_scenes]
-        self._val_views = [views for name in names for views in self.eval_views.choose(val, name)]
+        samples = [views for name in names for views in self.eval_views.choose(val, name)]
+        self._val_views = samples if self.eval_samples is None else spread(samples, self.eval_samples)
         refuse_overlap(train, self._train_names, val, self._val_views)
         self._train = BatchDataset(train, self.prepare, self.memory_mb, replace_damaged=True)
         self._val = BatchDataset(val, self.prepare, self.memory_mb)

@@ -11,6 +11,7 @@ from torch.nn import functional as F
 
 from vg2gt.geometry.cameras import strided_intrinsics, unproject
 from vg2gt.geometry.precision import full_precision
+from vg2gt.kernels.knn import interpolate, interpolation_weights
 from vg2gt.method.additions.silhouette import near_silhouettes
 from vg2gt.method.additions.surface_evidence import (
     CENTROID_CHANNELS,
@@ -31,7 +32,6 @@ from vg2gt.method.grid import (
     pool_min,
     scene_voxel_size,
 )
-from vg2gt.method.knn import interpolate, interpolation_weights
 from vg2gt.method.ptv3 import PTv3
 from vg2gt.types import Cameras, Geometry, Tokens, check_choice
 

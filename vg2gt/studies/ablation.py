@@ -62,7 +62,9 @@ OUR_COLUMNS = columns("abs_rel_rasterized", "decoded_abs_rel", "normal_mean", "c
 PAPER_ABLATION, PAPER_SPLIT, PAPER_DATA = "tbl_ablation", "tbl_split", "replica"
 # Paths of metrics in an evaluation: GT_POSE, except those in PATHS.
 GT_POSE = "rendered/gt_pose/solid/"
+CONTEXT_COLUMNS = {f"context/{name}": metric for name, metric in PAPER_COLUMNS.items()}
 PATHS = {
+    **{name: f"rendered/context/solid/{name.removeprefix('context/')}" for name in CONTEXT_COLUMNS},
     "abs_rel_rasterized": "rendered/gt_pose/rasterized/abs_rel",
     "decoded_abs_rel": "decoded/after/abs_rel",
     **{name: f"scene/{name}" for name in ("cv", "gaussians")},
@@ -210,6 +212,7 @@ class Ablation:
         if config.protocol is not None:
             overrides = " ".join(config.protocol_overrides)
             scenes = f", as in vg2gt evaluate evaluation={config.protocol} {overrides}".rstrip()
+            scenes += "; rows with context: the input views again, as the authors' code reports"
         return (
             f"Full model {config.full_steps} steps{begin}, then every row {config.steps} steps more from it, at a "
             f"learning rate of {config.lr:g}, with the same batches. {done} of {config.seeds} seeds complete;"
@@ -224,7 +227,8 @@ class Ablation:
 def _figures(report: Mapping[str, Any]) -> Metrics:
     """The metrics of an evaluation's report that the tables show, by their names in training."""
     ((_, views),) = report["views"].items()
-    found = {name: views["mean"].get(PATHS.get(name, GT_POSE + name)) for name in (*PAPER_COLUMNS, *OUR_COLUMNS)}
+    names = (*PAPER_COLUMNS, *CONTEXT_COLUMNS, *OUR_COLUMNS)
+    found = {name: views["mean"].get(PATHS.get(name, GT_POSE + name)) for name in names}
     return {name: value for name, value in found.items() if value is not None}
 
 
@@ -233,11 +237,13 @@ def _label(name: str) -> str:
 
 
 def _beside_paper(results: Mapping[str, Mapping[int, Metrics]], rows: Mapping[str, str]) -> str:
-    """Our rows, each followed by the paper's; ``rows`` maps names of rows to names of runs."""
+    """Our rows, on a protocol also of the input views, each followed by the paper's; ``rows``: names to runs."""
     ablation, split = (tables()[table][PAPER_DATA] for table in (PAPER_ABLATION, PAPER_SPLIT))
     lines = []
     for name, run in rows.items():
         lines.append([_label(name), *seeds_row(results[run], PAPER_COLUMNS)])
+        if any("context/psnr" in metrics for metrics in results[run].values()):
+            lines.append([f"{_label(name)}, context", *seeds_row(results[run], CONTEXT_COLUMNS)])
         theirs = {FULL: "VG2GT (full)", "splits=1": "w/o split"}.get(name, _label(name).replace("splits", "split"))
         paper = (split if name.startswith("splits=") else ablation).get(theirs)
         if paper:

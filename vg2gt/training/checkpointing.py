@@ -66,7 +66,7 @@ class NewestCheckpoints(ModelCheckpoint):
 class StopOnSignal(lightning.Callback):
     """On SIGTERM, Ctrl-C or SIGUSR1 (SLURM's notice), finishes the step, saves a checkpoint and ends normally.
 
-    A second Ctrl-C ends at once. Outside training, signals end the process as usual.
+    A second Ctrl-C ends at once. Outside training, signals end the process at once.
     """
 
     def __init__(self) -> None:
@@ -78,9 +78,14 @@ class StopOnSignal(lightning.Callback):
         self._previous = {number: signal.signal(number, self._note) for number in SIGNALS}
 
     def on_validation_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Restores the default SIGTERM outside training, where Lightning's handler would only record the signal."""
+        """Outside training, SIGTERM and SIGUSR1 end an evaluation at once, as there is nothing to save.
+
+        Lightning's handler would only record a SIGTERM. After SLURM's notice, the status is 0: the job requeues itself.
+        """
         if trainer.state.fn == TrainerFn.VALIDATING:
             signal.signal(signal.SIGTERM, signal.SIG_DFL)
+            if hasattr(signal, "SIGUSR1"):
+                signal.signal(signal.SIGUSR1, _leave)
 
     def _note(self, number: int, frame: FrameType | None) -> None:
         self.received = True
@@ -107,3 +112,8 @@ class StopOnSignal(lightning.Callback):
             if signal.getsignal(number) == self._note:
                 signal.signal(number, handler)
         self._previous = {}
+
+
+def _leave(number: int, frame: FrameType | None) -> None:
+    log.warning("stopping after a signal: the evaluation is repeated when the run continues with ckpt=auto")
+    raise SystemExit(0)

@@ -18,6 +18,7 @@ from hydra.utils import instantiate
 from lightning.fabric.utilities.rank_zero import rank_zero_only
 from lightning.pytorch import LightningDataModule, Trainer
 from lightning.pytorch.callbacks import ProgressBar
+from lightning.pytorch.plugins.environments import SLURMEnvironment, TorchElasticEnvironment
 from omegaconf import DictConfig
 
 from backends.cache import TokenCache
@@ -116,10 +117,16 @@ def build(config: DictConfig) -> Run:
         precision=trainer_precision(str(config.trainer.precision), accelerator),
         callbacks=_callbacks(config),
         logger=[instantiate(logger) for logger in config.logger.values() if logger],
-        plugins=[AtomicCheckpointIO()],
+        plugins=_plugins(),
         default_root_dir=config.output_dir,
     )
     return Run(module, datamodule, trainer, Path(config.output_dir))
+
+
+def _plugins() -> list[Any]:
+    """Our checkpoints; and in a SLURM job its tasks, without Lightning's requeueing, as the job's script requeues."""
+    slurm = SLURMEnvironment.detect() and not TorchElasticEnvironment.detect()
+    return [AtomicCheckpointIO(), *([SLURMEnvironment(auto_requeue=False)] if slurm else [])]
 
 
 def _quieten_lightning() -> None:
@@ -166,8 +173,14 @@ def _check(config: DictConfig) -> None:
         )
     if trainer.get("accumulate_grad_batches", 1) != 1:
         raise ValueError(
-            "trainer.accumulate_grad_batches is not supported: each batch is determined by the optimiser step; for "
-            "larger steps, raise data.max_images"
+            "trainer.accumulate_grad_batches is not supported: batches, random draws and checkpoints are determined by "
+            "the optimiser step. Raise data.max_images, or take more and smaller steps (docs/guides/cluster.md)"
+        )
+    limit = trainer.get("limit_val_batches")
+    if limit and not (isinstance(limit, float) and limit == 1):
+        raise ValueError(
+            f"trainer.limit_val_batches={limit} counts per device, so that metrics would depend on the number of "
+            "devices: use data.eval_samples, which counts all scenes or windows"
         )
     if trainer.get("gradient_clip_algorithm") not in (None, "norm"):
         raise ValueError(

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
 from vg2gt.data.base import DataError, SceneSource
 from vg2gt.data.views import SceneSample
+
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
@@ -50,12 +53,12 @@ class EvaluationViews:
 
     def _choose(self, scene: str, frames: list[int], held_out: set[int]) -> SceneSample:
         if isinstance(self.context, int):
-            context = _spread([frame for frame in frames if frame not in held_out], self.context)
+            context = spread([frame for frame in frames if frame not in held_out], self.context)
         else:
             context = _at(frames, self.context, scene, "eval_context")
         if isinstance(self.target, int):
             inputs, kept = set(context), [frame for frame in frames if frame in held_out]
-            target = _spread(kept or [frame for frame in frames if frame not in inputs], self.target)
+            target = spread(kept or [frame for frame in frames if frame not in inputs], self.target)
         else:
             target = _at(frames, self.target, scene, "eval_target")
         if not context:
@@ -66,14 +69,14 @@ class EvaluationViews:
         return SceneSample(scene, tuple(context), tuple(target))
 
 
-def _spread(frames: list[int], count: int) -> list[int]:
-    """Returns ``count`` evenly spaced frames, both ends included; all of them if there are fewer."""
-    if count >= len(frames):
-        return frames
+def spread(items: list[Item], count: int) -> list[Item]:
+    """Returns ``count`` evenly spaced items, both ends included; all of them if there are fewer."""
+    if count >= len(items):
+        return items
     if count == 0:
         return []
-    places = np.linspace(0, len(frames) - 1, count) if count > 1 else np.array([(len(frames) - 1) / 2])
-    return [frames[int(place + 0.5)] for place in places]
+    places = np.linspace(0, len(items) - 1, count) if count > 1 else np.array([(len(items) - 1) / 2])
+    return [items[int(place + 0.5)] for place in places]
 
 
 def _at(frames: list[int], positions: Sequence[int], scene: str, name: str) -> list[int]:
