@@ -43,7 +43,7 @@ def backend(request: pytest.FixtureRequest):
 
 def load_config(name: str, *overrides: str) -> DictConfig:
     """One file of configs/backend with overrides such as ``pretrained=false``."""
-    return compose(None, f"+backend={name}", *(f"backend.{override}" for override in overrides)).backend
+    return compose(None, f"+backend={name}", *(f"++backend.{override}" for override in overrides)).backend
 
 
 def make_backend(name: str, *overrides: str) -> Backend:

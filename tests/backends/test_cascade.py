@@ -169,5 +169,5 @@ def test_depth_is_in_the_unit_of_the_cameras_and_needs_no_range(make_scene) -> N
 
 
 def test_weights_must_be_named() -> None:
-    with pytest.raises(ValueError, match=r"no weights in the package: give backend\.path=FILE"):
+    with pytest.raises(FileNotFoundError, match=r"no published weights: give backend\.path=FILE"):
         CascadeBackend()

@@ -14,7 +14,8 @@ NON_COMMERCIAL = {"da3_large", "da3_giant"}
 
 def check_signature(config: DictConfig) -> None:
     parameters = inspect.signature(get_class(config._target_).__init__).parameters
-    assert set(config) - {"_target_"} == set(parameters) - {"self"}
+    needed = {name for name, parameter in parameters.items() if parameter.default is parameter.empty} - {"self"}
+    assert needed <= set(config) - {"_target_"} <= set(parameters)
     for value in config.values():
         if isinstance(value, DictConfig):
             check_signature(value)

@@ -146,7 +146,8 @@ def step_by_step(
     run.trainer.callbacks.append(steps)  # pyright: ignore[reportAttributeAccessIssue]
     audit = fit(run, batches)
     assert not any(audit.skipped)
-    return {**vars(steps), "views": [batch.num_context for batch in batches]}
+    views = [batch.num_context for batch in batches]
+    return {"weights": steps.weights, "gradients": steps.gradients, "losses": steps.losses, "views": views}
 
 
 class KilledAt(lightning.Callback):

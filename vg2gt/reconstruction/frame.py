@@ -177,7 +177,7 @@ def read_place(figures: dict[str, Any], to_source: NDArray[np.float64]) -> Place
     if gps is None:
         return None
     latitude, longitude, altitude = gps["origin"]
-    to_enu = np.array(gps["to_enu"]) @ np.linalg.inv(to_source)
+    to_enu = np.asarray(np.array(gps["to_enu"]) @ np.linalg.inv(to_source), np.float64)
     known = (gps["error"], gps["scale_error"], gps["positions"], gps["up"] is not None)
     return Place(to_enu, (latitude, longitude, altitude), *known)
 

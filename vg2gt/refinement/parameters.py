@@ -243,9 +243,13 @@ class Parameters:
         """Applies a change of rows to all that is known of the Gaussians."""
         unit, size, counts = change(self.unit), change(self.size), change(self.counts)
         values = self.values | {name: change(self.values[name]) for name in OF_GAUSSIANS}
-        moments = self.moments | {name: tuple(map(change, self.moments[name])) for name in OF_GAUSSIANS}
+        moments = self.moments | {name: _both(change, self.moments[name]) for name in OF_GAUSSIANS}
         # at once, because Ctrl-C during the copies must leave a scene that fits together
         self.unit, self.size, self.counts, self.values, self.moments = unit, size, counts, values, moments
+
+
+def _both(change: Callable[[Tensor], Tensor], moments: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    return change(moments[0]), change(moments[1])
 
 
 def update_rows_reference(

@@ -84,7 +84,8 @@ class COLMAP(FileSource):
         with errors_name(scene):
             records = colmap_images(read_colmap(model_folder))
             named = {i: named_file(folder / self.images, record.name, where) for i, record in enumerate(records)}
-            color = self.sound({i: found for i, path in named.items() if (found := existing_image(path)) is not None})
+            there = {i: found for i, path in named.items() if (found := existing_image(path)) is not None}
+            color = self.sound(there)
         if not color:
             names = f"the first is {records[0].name}, expected at {named[0]}" if records else "it names none"
             raise DataError(
@@ -92,7 +93,8 @@ class COLMAP(FileSource):
                 "them there, or set data.images to the name of their folder"
             )
         masks = find_masks(folder / MASKS, {i: records[i].name for i in color}, color, f"scene {scene}")
-        poses = {i: invert_pose(colmap_pose(record)) for i, record in enumerate(records)}
+        damaged = there.keys() - color.keys()  # their names have been said
+        poses = {i: invert_pose(colmap_pose(record)) for i, record in enumerate(records) if i not in damaged}
         posed: dict[int, PosedImage] = {}
         for i, path in color.items():
             camera = records[i].camera

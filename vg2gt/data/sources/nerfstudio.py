@@ -80,7 +80,8 @@ class Nerfstudio(FileSource):
         where = f"{transforms_files(folder)[0]} of scene {scene}"
         with errors_name(scene):
             named = _named_files(folder, records, "file_path", where)
-            color = self.sound({i: found for i, path in named.items() if (found := existing_image(path)) is not None})
+            there = {i: found for i, path in named.items() if (found := existing_image(path)) is not None}
+            color = self.sound(there)
             depth = _named_files(folder, records, "depth_file_path", where) if self.has_depth else {}
             depth = {i: path for i, path in depth.items() if path.is_file()}
             masks = _named_files(folder, records, "mask_path", where)
@@ -91,7 +92,9 @@ class Nerfstudio(FileSource):
         if not color:
             tried = f"; tried {named[0]} and other endings" if named else ""
             raise DataError(f"scene {scene}: none of the {len(records)} images of {where} exists{tried}")
-        poses = {i: invert_pose(np.asarray(record.world_to_camera, np.float64)) for i, record in enumerate(records)}
+        damaged = there.keys() - color.keys()  # their names have been said
+        sound = {i: record for i, record in enumerate(records) if i not in damaged}
+        poses = {i: invert_pose(np.asarray(record.world_to_camera, np.float64)) for i, record in sound.items()}
         posed = {i: _posed(scene, where, records[i].lens, path, masks.get(i)) for i, path in color.items()}
         index = make_index(scene, folder, color, depth if self.has_depth else None, poses, {}, posed=posed)
         return replace(index, extra={**index.extra, "test": np.array(index.frame_ids) >= first_test})

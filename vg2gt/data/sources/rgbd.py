@@ -189,6 +189,9 @@ class RGBDFolder(FileSource):
         if self.intrinsics is None:
             known = [path for path in cameras if path.is_file()]
             intrinsics = _read_intrinsics(known, folder, scene, color_size, depth_size)
+        damaged = color.keys() - sound.keys()  # their names have been said
+        depth = {i: path for i, path in depth.items() if i not in damaged}
+        read = {i: pose for i, pose in read.items() if i not in damaged}
         return Recording(sound, depth, read, dict.fromkeys(sound, intrinsics), color_size, depth_size)
 
 
