@@ -48,7 +48,7 @@ def test_the_limit_of_evaluated_windows_is_that_of_all_devices_together(rooms):
         found = []
         for rank in range(devices):
             strategy = SimpleNamespace(root_device=torch.device("cpu"))
-            module.trainer = SimpleNamespace(global_rank=rank, world_size=devices, strategy=strategy)
+            module.trainer = SimpleNamespace(global_rank=rank, world_size=devices, strategy=strategy)  # pyright: ignore[reportAttributeAccessIssue]
             found += [(views.scene, *views.context) for (views,) in module.val_dataloader().sampler]
         return sorted(found)
 

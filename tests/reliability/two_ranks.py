@@ -134,8 +134,8 @@ def step_by_step(
         for parameter in run.module.model.trained_parameters():
             parameter += 0.02 * torch.randn(parameter.shape, generator=generator)
     run.datamodule.setup("fit")
-    data = run.datamodule._train
-    scenes, views = run.datamodule._train_names, run.datamodule.sampler
+    module: Any = run.datamodule
+    data, scenes, views = module._train, module._train_names, module.sampler
     samplers = [StepSampler(data.source, scenes, views, 100, rank=rank, world_size=2) for rank in ranks]
     batches = []
     for step, change in enumerate(ON_RANK_1):
