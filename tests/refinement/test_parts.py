@@ -9,9 +9,9 @@ import torch
 
 from tests.refinement.conftest import VIEWS, Start
 from vg2gt.geometry.cameras import invert_rigid
-from vg2gt.kernels.adam import update_rows
+from vg2gt.kernels.adam import RowUpdate, bias_corrections, update_rows, update_rows_reference
 from vg2gt.refinement import Observations, RefinedScene, RefineLoss, RefineRates
-from vg2gt.refinement.parameters import BETAS, EPSILON, Parameters, update_rows_reference
+from vg2gt.refinement.parameters import BETAS, EPSILON, Parameters
 from vg2gt.refinement.refine import ViewOrder, split_views
 
 PIXEL, DEPTH = 0.01, 2.0
@@ -133,9 +133,9 @@ def test_compiled_adam_is_adam(shape: tuple[int, ...], dtype: torch.dtype) -> No
     every = torch.randperm(count)
     for step in range(1, 4):
         grad = torch.randn_like(value)
-        corrections = [torch.full((count,), 1 / (1 - beta**step), dtype=dtype) for beta in BETAS]
+        corrections = bias_corrections(torch.full((count,), step, dtype=dtype), BETAS)
         for update, (own, moments) in zip((update_rows, update_rows_reference), states, strict=True):
-            update(own, moments, grad[every], every, corrections, unit, (*BETAS, EPSILON, rate))
+            update(RowUpdate(own, moments, grad[every], every, corrections, unit, BETAS, EPSILON, rate))
         leaf.grad = grad
         adam.step()
     torch.testing.assert_close(states[0], states[1])
@@ -143,9 +143,9 @@ def test_compiled_adam_is_adam(shape: tuple[int, ...], dtype: torch.dtype) -> No
     # some rows only, in units of their own: the others stay
     rows, unit = torch.arange(0, count, 3), torch.rand(count, dtype=dtype) + 0.5
     before, grad = states[0][0].clone(), torch.randn(len(rows), *shape, dtype=dtype)
-    corrections = [each[: len(rows)] for each in corrections]
+    corrections = bias_corrections(torch.arange(len(rows), dtype=dtype) + 1, BETAS)
     for update, (own, moments) in zip((update_rows, update_rows_reference), states, strict=True):
-        update(own, moments, grad, rows, corrections, unit, (*BETAS, EPSILON, rate))
+        update(RowUpdate(own, moments, grad, rows, corrections, unit, BETAS, EPSILON, rate))
     torch.testing.assert_close(states[0], states[1])
     assert torch.equal(states[0][0][1::3], before[1::3])
     assert not torch.equal(states[0][0][::3], before[::3])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -13,7 +13,7 @@ from torch.nn import functional as F
 from vg2gt.geometry.alignment import Similarity
 from vg2gt.geometry.cameras import compose, invert_rigid
 from vg2gt.geometry.rotations import quat_to_matrix
-from vg2gt.kernels.adam import update_rows
+from vg2gt.kernels.adam import RowUpdate, bias_corrections, update_rows
 from vg2gt.refinement.options import RefineRates
 from vg2gt.types import Cameras, Gaussians, TensorRecord
 
@@ -178,25 +178,16 @@ class Parameters:
         rows = every if self._rows is None else self._rows
         self.steps += 1
         self.counts[rows] += 1
-        corrections = [1 / (1 - beta ** self.counts[rows]) for beta in BETAS]
-        update = update_rows if rows.device.type == "cpu" else update_rows_reference
-        ones = torch.ones_like(self.unit)
+        of_gaussians = (rows, bias_corrections(self.counts[rows], BETAS))
+        views = torch.arange(len(self.values["cameras"]), device=rows.device)  # every step changes all of them
+        of_views = (views, bias_corrections(torch.full_like(self.values["cameras"][:, 0], self.steps), BETAS))
         for name, grad in grads.items():
-            rate = share * self.rates[name]
-            if rate and name in OF_GAUSSIANS:
-                unit = self.unit if name == "means" else ones
-                args = (self.values[name], self.moments[name], grad, rows, corrections, unit)
-                update(*args, (*BETAS, EPSILON, rate))
-            elif rate:
-                self._update_views(name, grad, rate)
+            if rate := share * self.rates[name]:
+                value, moments = self.values[name], self.moments[name]
+                unit = self.unit if name == "means" else value.new_ones(len(value))
+                which = of_gaussians if name in OF_GAUSSIANS else of_views
+                update_rows(RowUpdate(value, moments, grad, *which, unit, BETAS, EPSILON, rate))
         return True
-
-    def _update_views(self, name: str, grad: Tensor, rate: float) -> None:
-        """Updates what belongs to the views; all of it changes in every step."""
-        views = torch.arange(len(grad), device=grad.device)
-        corrections = [grad.new_full((len(grad),), 1 / (1 - beta**self.steps)) for beta in BETAS]
-        args = (self.values[name], self.moments[name], grad, views, corrections, grad.new_ones(len(grad)))
-        update_rows_reference(*args, (*BETAS, EPSILON, rate))
 
     @torch.no_grad()
     def prune(self) -> None:
@@ -250,27 +241,3 @@ class Parameters:
 
 def _both(change: Callable[[Tensor], Tensor], moments: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
     return change(moments[0]), change(moments[1])
-
-
-def update_rows_reference(
-    value: Tensor,
-    moments: tuple[Tensor, Tensor],
-    grad: Tensor,
-    rows: Tensor,
-    corrections: Sequence[Tensor],
-    unit: Tensor,
-    settings: tuple[float, float, float, float],
-) -> None:
-    """:func:`vg2gt.kernels.adam.update_rows` in plain torch, for any device; arguments as there."""
-    beta, gamma, epsilon, rate = settings
-    first, second = moments
-
-    def per_row(numbers: Tensor) -> Tensor:
-        return numbers.view(-1, *[1] * (grad.dim() - 1))
-
-    scale = per_row(unit[rows])
-    grad = grad * scale
-    first[rows] = mean = first[rows].lerp_(grad, 1 - beta)
-    second[rows] = square = second[rows].mul_(gamma).addcmul_(grad, grad, value=1 - gamma)
-    change = mean * per_row(corrections[0]) / (square * per_row(corrections[1])).sqrt_().add_(epsilon) * scale
-    value[rows] -= rate * change
