@@ -29,8 +29,8 @@ def chunks(path: Path) -> tuple[dict, bytes]:
     assert (magic, version, length) == (b"glTF", 2, len(data))
     size, kind = struct.unpack_from("<I4s", data, 12)
     assert (kind, size % 4) == (b"JSON", 0)
-    rest, tail = struct.unpack_from("<I4s", data, 20 + size)
-    assert (tail, rest % 4, 28 + size + rest) == (b"BIN\0", 0, len(data))
+    length, tail = struct.unpack_from("<I4s", data, 20 + size)
+    assert (tail, length % 4, 28 + size + length) == (b"BIN\0", 0, len(data))
     return json.loads(data[20 : 20 + size]), data[28 + size :]
 
 

@@ -108,7 +108,7 @@ def test_dragging_turns_around_what_the_middle_shows() -> None:
 
 
 def test_measuring_cropping_and_views_to_keep() -> None:
-    """What is measured is what vg2gt place takes; a kept view is a camera of ours; a crop leaves the rest away."""
+    """What is measured is what vg2gt place takes; a kept view is a camera of ours; a crop hides what is outside it."""
     record = ball_before_a_wall().initial().fields()
     answer = run(f"""
         const view = new View([0, -1, 0]);

@@ -58,7 +58,7 @@ def enu(positions: NDArray[np.float64], origin: NDArray[np.float64]) -> NDArray[
 
     Args:
         positions: ``[N, 3]`` latitude and longitude in degrees (WGS 84), altitude in metres.
-        origin: ``[3]``, likewise.
+        origin: latitude, longitude and altitude ``[3]`` of the origin.
 
     Returns:
         ``[N, 3]``.

@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 
 from vg2gt.data.base import DataError
 from vg2gt.data.sources.undistortion import is_pinhole, lens_text, undistortion_of
-from vg2gt.inputs.pictures import read_each
+from vg2gt.inputs.damaged import read_each
 from vg2gt.io.cameras_json import NamedCamera, Photo
 from vg2gt.io.colmap import colmap_intrinsics, require_pycolmap
 from vg2gt.io.errors import FormatError

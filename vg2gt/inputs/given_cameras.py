@@ -20,6 +20,7 @@ from vg2gt.data.sources.phone import app_of
 from vg2gt.data.sources.rgbd import RGBDFolder
 from vg2gt.data.sources.undistortion import size_on_disk, undistortion_of
 from vg2gt.geometry.cameras import resize_intrinsics
+from vg2gt.inputs.damaged import read_each
 from vg2gt.inputs.folders import image_files, image_folders, is_photo
 from vg2gt.inputs.foreign import camera_files_in, foreign_cameras
 from vg2gt.inputs.pictures import (
@@ -31,7 +32,6 @@ from vg2gt.inputs.pictures import (
     existing_path,
     frame_of,
     mask_for,
-    read_each,
     shrunk,
     with_unique_names,
 )

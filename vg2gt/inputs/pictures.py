@@ -7,7 +7,7 @@ import importlib.util
 import itertools
 import logging
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
@@ -24,9 +24,10 @@ from vg2gt.data.sources.masks import joined_masks, mask_beside, resized_mask, wa
 from vg2gt.data.sources.parsing import HEIC_SUFFIXES, PHOTO_SUFFIXES
 from vg2gt.data.sources.sparse_points import ObservedPoints
 from vg2gt.data.transforms import from_bytes, to_bytes
+from vg2gt.inputs.damaged import name_left_out, readable
 from vg2gt.inputs.folders import image_files, is_photo
 from vg2gt.inputs.panoramas import Panorama, find_panoramas, whole_pixels
-from vg2gt.io.errors import DataError, some
+from vg2gt.io.errors import some
 from vg2gt.io.image_files import focal_length, image_size, is_damaged, read_color, read_mask, read_mask_file
 from vg2gt.io.images import color_image, has_alpha
 from vg2gt.io.photogrammetry import is_camera_file
@@ -235,7 +236,7 @@ def _pictures(item: Any, max_images: int | None, faults: dict[str, str]) -> list
 
 def _photos(files: Sequence[Path], faults: dict[str, str]) -> list[Picture]:
     """Returns photographs, panoramas as the faces of a cube; what is wrong with others is added to ``faults``."""
-    photos = _readable(files, _photo, faults)
+    photos = readable(files, _photo, faults)
     panoramas = find_panoramas([(file, photo.size) for file, photo in photos.items()])
     if panoramas:
         first = next(iter(panoramas)).name
@@ -245,56 +246,6 @@ def _photos(files: Sequence[Path], faults: dict[str, str]) -> list[Picture]:
         for file, photo in photos.items()
         for picture in (_faces(photo, file, panoramas[file]) if file in panoramas else [photo])
     ]
-
-
-def _readable(files: Iterable[Path], read: Callable[[Path], T], faults: dict[str, str]) -> dict[Path, T]:
-    """Returns what ``read`` makes of image files; what is wrong with damaged ones is added to ``faults``, by path."""
-    found: dict[Path, T] = {}
-    for file in files:
-        try:
-            found[file] = read(file)
-        except DataError as error:
-            if not is_damaged(file):
-                raise
-            faults[str(file)] = reason_of(error)
-    return found
-
-
-def read_each(files: Collection[Path], read: Callable[[Path], T]) -> list[T]:
-    """Returns what ``read`` makes of each image file; damaged ones are left out and named in a warning.
-
-    Raises:
-        DataError: if no image is left, or ``read`` raises it for one that is not damaged.
-    """
-    faults: dict[str, str] = {}
-    found = _readable(files, read, faults)
-    name_left_out(faults, len(files))
-    return list(found.values())
-
-
-def reason_of(error: DataError) -> str:
-    """Returns why an image cannot be read, without its name."""
-    return f"cannot be read ({error.__cause__ or error})"
-
-
-def name_left_out(faults: Mapping[str, str], count: int) -> None:
-    """Warns about images that are left out.
-
-    Args:
-        faults: what is wrong with each, by name, such as "is black".
-        count: number of all images.
-
-    Raises:
-        DataError: if no image is left.
-    """
-    if not faults:
-        return
-    if count == 1:
-        raise DataError(" ".join(("the only image", *next(iter(faults.items())))))
-    said = some([f"{name} {fault}" for name, fault in faults.items()], separator="; ")
-    if len(faults) == count:
-        raise DataError(f"none of the {count} images can be used: {said}")
-    log.warning("%d of %d images are left out: %s", len(faults), count, said)
 
 
 def _allow_heic(path: Path) -> None:

@@ -19,7 +19,8 @@ from scipy import ndimage
 from vg2gt.data.base import DataError, Frames
 from vg2gt.data.sources.masks import joined_masks, resized_mask
 from vg2gt.data.transforms import to_bytes
-from vg2gt.inputs.pictures import IN_MEMORY, Picture, name_left_out, reason_of
+from vg2gt.inputs.damaged import name_left_out, reason_of
+from vg2gt.inputs.pictures import IN_MEMORY, Picture
 from vg2gt.io.images import curvatures
 from vg2gt.monitor import Monitor
 

@@ -132,9 +132,9 @@ def read_gaussian_gltf(path: str | Path) -> Gaussians:
         raise FormatError(f"{path}: not a glTF file, or damaged ({type(error).__name__}: {error})") from error
     if not found:
         raise FormatError(f"{path} holds no Gaussians ({_NAME}); a mesh or points are not shown")
-    joined, *rest = sorted(found, key=lambda part: -part.sh.shape[1])
-    for others in rest:
-        joined = joined.joined(others)
+    joined, *others = sorted(found, key=lambda part: -part.sh.shape[1])
+    for other in others:
+        joined = joined.joined(other)
     return joined
 
 
