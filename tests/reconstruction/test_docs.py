@@ -44,9 +44,10 @@ def _examples(page: str) -> list[dict[str, Any]]:
     return found
 
 
-def test_a_recording_is_reconstructed_and_rendered(workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_recording_is_reconstructed_and_rendered(workplace: Path, monkeypatch, capsys: pytest.CaptureFixture) -> None:
     (words,) = [words for words in _commands("docs/guides/photos.md", "reconstruct") if "recording/" in words]
     _run(words, monkeypatch)
+    assert capsys.readouterr().out.endswith("to look at it: vg2gt view outputs/room --open\n")
     room = workplace / "outputs" / "room"
     assert {p.name for p in room.iterdir()} == {"scene.ply", "cameras.json", "views.npz", "report.png", "report.json"}
     for words in _commands("docs/guides/view.md", "render"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+import shlex
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -78,6 +79,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     """Reconstructs a scene and writes the outputs."""
     from vg2gt.api import check_refinement, load
+    from vg2gt.io.gaussian_files import READERS
     from vg2gt.memory import RECONSTRUCTION, memory_advice
     from vg2gt.monitor import Monitor
     from vg2gt.outputs.outputs import cost_figures, write_outputs
@@ -130,6 +132,8 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     print(f"weights: {figures['weights']}; cameras: {scene.cameras_from or PREDICTED}")
     print(f"seconds: {times}; peak memory {cost['peak_memory_mib']} MiB")
     print(f"written: {', '.join(str(folder / name) for name in options.save)}")
+    if any(f"scene{suffix}" in options.save for suffix in READERS):
+        print(f"to look at it: vg2gt view {shlex.quote(str(folder))} --open")
 
 
 def _check(options: argparse.Namespace, overrides: Sequence[str]) -> None:
