@@ -1,4 +1,4 @@
-"""Gaussians in glTF: ``.glb`` and ``.gltf`` with Khronos' ratified ``KHR_gaussian_splatting``.
+"""Gaussians in glTF: ``.glb`` and ``.gltf`` with Khronos' ``KHR_gaussian_splatting``, after its release candidate.
 
 A point primitive with linear scales, rotations xyzw, opacities in [0, 1] and a VEC3 for each spherical harmonic, and
 colours as points for viewers that do not know the extension. Compressed files hold an SPZ of version 2 instead, as the
