@@ -19,7 +19,7 @@ from vg2gt.refinement import (
     sharpen,
 )
 from vg2gt.refinement import sharpen as _sharpen
-from vg2gt.refinement.growth import contributions, footprints, in_front, remove_idle, split_large
+from vg2gt.refinement.growth import contributions, footprints, in_front, in_front_reference, remove_idle, split_large
 from vg2gt.refinement.parameters import Parameters
 from vg2gt.refinement.photographs import Crop, CropOrder
 from vg2gt.rendering import Renderer
@@ -54,10 +54,22 @@ def test_a_crop_is_rendered_as_the_same_part_of_the_whole_from_the_gaussians_in_
     cameras = photographs.cameras(start.cameras)
     whole = start.renderer(start.gaussians, cameras).color[0, 2]
     crop = Crop(2, 40, 100, (64, 48))
-    rows = in_front(start.gaussians.scales.max(-1).values, start.gaussians.means, crop.camera(cameras), NEAR)
+    rows = in_front(start.gaussians.scales.log(), start.gaussians.means, crop.camera(cameras), NEAR)
     assert len(rows) < 0.7 * len(start.gaussians)
     part = start.renderer(start.gaussians.select(rows), crop.camera(cameras)).color[0, 0]
     torch.testing.assert_close(part, whole[:, 40:104, 100:148], atol=1e-5, rtol=0)
+
+
+def test_what_may_be_visible_is_found_as_the_reference_finds_it() -> None:
+    generator = torch.Generator().manual_seed(0)
+    means = 2 * torch.randn(5000, 3, generator=generator)  # half of them behind the camera
+    scales = torch.randn(5000, 3, generator=generator) - 4
+    intrinsics = torch.tensor([[300.0, 0, 20], [0, 310, 170], [0, 0, 1]])
+    camera = Cameras(torch.eye(4)[None, None], intrinsics[None, None], (120, 160))
+    found = in_front(scales, means, camera, NEAR)
+    assert 100 < len(found) < 2500
+    assert torch.equal(found, in_front_reference(scales, means, camera, NEAR))
+    assert torch.equal(found, in_front(scales.double(), means.double(), camera.map(torch.Tensor.double), NEAR))
 
 
 def test_a_crop_knows_its_pixels_and_the_depth_of_the_nearest_pixel_of_its_view(

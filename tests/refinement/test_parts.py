@@ -110,8 +110,9 @@ def test_a_perfect_view_has_no_loss(start: Start) -> None:
     assert not RefineLoss().with_geometry(0).needs_geometry
     size = start.gaussians.scales.max(-1).values
     priced = RefineLoss(opacity=0.1, scale=2.0)
-    terms = priced.of_gaussians(start.gaussians, size / 2)
-    assert float(priced.total(terms)) == pytest.approx(2 + 0.1 * float(start.gaussians.opacities.mean()))
+    weights = (torch.arange(len(size)) % 2).to(size.dtype)
+    terms = priced.of_gaussians(start.gaussians, size / 2, weights)
+    assert float(priced.total(terms)) == pytest.approx(2 + 0.1 * float((weights * start.gaussians.opacities).mean()))
     off = replace(rendered, depth=1.1 * rendered.depth)
     moved = RefineLoss().of_views(off, start.cameras, seen, 2.0)["depth_consistency"]
     hits = (rendered.depth > 0) & (rendered.alpha > 0.5)

@@ -11,6 +11,7 @@ from tests.refinement.conftest import VIEWS, Start, run
 from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.refinement import Refined, RefinedScene, RefineLoss, RefineOptions, RefineRates
 from vg2gt.refinement.density import GROWTH, merged, supported
+from vg2gt.refinement.growth import contributions
 from vg2gt.refinement.options import Progress
 from vg2gt.types import Gaussians
 
@@ -100,6 +101,23 @@ def test_a_price_of_opacity_makes_gaussians_transparent(start: Start) -> None:
         for weight in (0.0, 9.0)
     )
     assert priced < plain - 0.002
+
+
+def test_what_only_left_out_views_show_keeps_its_opacity(start: Start) -> None:
+    views = torch.arange(VIEWS)
+    alone = contributions(start.gaussians, start.cameras.select(views[2:]), start.renderer) <= 1e-6
+    hidden = contributions(start.gaussians, start.cameras, start.renderer) <= 1e-6
+    assert (alone & ~hidden).sum() > 50
+    priced = RefineOptions(steps=9, fill=0, loss=replace(COLOUR, opacity=9.0))
+    parts = (start.gaussians, start.cameras, start.seen, start.renderer, priced, time.monotonic)
+    left = {}
+    for fold in (views[:2], views[:0]):
+        refinement = import_module("vg2gt.refinement.refine")._Refinement(*parts, fold)
+        for _ in range(4):
+            refinement._step()
+        left[len(fold)] = refinement.parameters.scene().gaussians.opacities.detach()[alone & ~hidden]
+    torch.testing.assert_close(left[2], start.gaussians.opacities[alone & ~hidden], atol=1e-3, rtol=0)
+    assert left[0].mean() < left[2].mean() - 0.002
 
 
 @pytest.mark.parametrize("trouble", ["means", "nan"])

@@ -8,13 +8,17 @@ import torch
 from torch import Tensor
 
 from vg2gt.geometry.spherical_harmonics import DC
+from vg2gt.kernels.culling import rows_in_front
+from vg2gt.kernels.threads import compilable
 from vg2gt.refinement.parameters import Parameters
 from vg2gt.rendering import Renderer
 from vg2gt.types import Cameras, Gaussians
 
 MARGIN = 0.1  # of the image around it, within which a view counts as seeing a Gaussian
 REACH = 3.33  # standard deviations up to which a Gaussian is visible: exp(-REACH^2 / 2) = 1 / 255
+LOWPASS = 2.0  # pixels, more than the low-pass filter adds to this reach
 SHRINK, OFFSET = 0.62, 0.55  # of halves: their sum has nearly the shape of the whole, and overlaps by half
+UNSEEN = 1e-6  # contribution up to which a view does not show a Gaussian
 SURVEY = 280  # longer side in pixels of the renderings that measure contributions
 
 
@@ -36,20 +40,29 @@ def footprints(means: Tensor, cameras: Cameras, near: float) -> Tensor:
     return found
 
 
-def in_front(sizes: Tensor, means: Tensor, camera: Cameras, near: float) -> Tensor:
+def in_front(scales: Tensor, means: Tensor, camera: Cameras, near: float) -> Tensor:
     """Returns the index ``[N]`` of the Gaussians that may be visible in one view.
 
     Args:
-        sizes: ``[G]`` largest standard deviations.
+        scales: ``[G, 3]`` logarithm of the standard deviations.
         means: ``[G, 3]`` positions.
         camera: camera of the view (B = V = 1), such as one whose principal point is moved to a crop.
         near: near plane in scene units.
     """
+    if compilable(scales, means, camera.intrinsics):
+        height, width = camera.size
+        limits = (float(width), float(height), near, REACH, LOWPASS)
+        return rows_in_front(scales, means, camera.world_to_camera[0, 0], camera.intrinsics[0, 0], limits)
+    return in_front_reference(scales, means, camera, near)
+
+
+def in_front_reference(scales: Tensor, means: Tensor, camera: Cameras, near: float) -> Tensor:
+    """:func:`in_front` in plain torch."""
+    sizes = scales.max(-1).values.exp()
     pixels, depth = _projected(means, camera, 0, near)
     slant = ((pixels - camera.intrinsics[0, 0, :2, 2]) / camera.intrinsics[0, 0, [0, 1], [0, 1]]).square().sum(-1)
     focal = camera.intrinsics[0, 0, [0, 1], [0, 1]].max()
-    # the low-pass filter adds less than a pixel
-    radius = (REACH * focal * sizes / depth.clamp(min=near) * (1 + slant).sqrt() + 2)[:, None]
+    radius = (REACH * focal * sizes / depth.clamp(min=near) * (1 + slant).sqrt() + LOWPASS)[:, None]
     size = pixels.new_tensor(camera.size[::-1])
     seen = ((pixels > -radius) & (pixels < size + radius)).all(-1) & (depth > near)
     return seen.nonzero()[:, 0]
@@ -82,6 +95,12 @@ def contributions(gaussians: Gaussians, cameras: Cameras, renderer: Renderer) ->
 
 
 @torch.no_grad()
+def shown(gaussians: Gaussians, cameras: Cameras, renderer: Renderer) -> Tensor:
+    """Returns ``[G]`` 1 for Gaussians that contribute to a view of ``cameras`` (B = 1), else 0."""
+    return (contributions(gaussians, cameras, renderer) > UNSEEN).to(gaussians.means.dtype)
+
+
+@torch.no_grad()
 def remove_idle(parameters: Parameters, cameras: Cameras, renderer: Renderer, least: float) -> None:
     """Removes Gaussians that views see but that hardly contribute to any.
 
@@ -94,7 +113,7 @@ def remove_idle(parameters: Parameters, cameras: Cameras, renderer: Renderer, le
         least: smallest contribution (:func:`contributions`).
     """
     weights = contributions(parameters.scene().gaussians, cameras, renderer)
-    keep = (weights >= least) | (weights <= 1e-6)
+    keep = (weights >= least) | (weights <= UNSEEN)
     if keep.any():
         parameters.keep(keep)
 

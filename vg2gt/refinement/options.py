@@ -82,7 +82,8 @@ class RefineLoss:
         depth_consistency: weight of the L1 distance to the decoded depth, in median depths of the scene.
         normal_render: weight of ``1 - cos`` between rendered normals and the normals of the rendered depth.
         normal_decoded: weight of ``1 - cos`` between rendered normals and the normals of the decoded depth.
-        opacity: weight of the mean opacity, which makes Gaussians that no image needs transparent.
+        opacity: weight of the mean opacity of what trained views show, which makes Gaussians that no image needs
+            transparent.
         scale: weight of the mean growth of each Gaussian's largest side, relative to its initial length.
 
     Raises:
@@ -139,11 +140,17 @@ class RefineLoss:
             terms["normal_decoded"] = normal_error(normal, expected, seen.depth_conf, hits & valid)
         return terms
 
-    def of_gaussians(self, gaussians: Gaussians, size: Tensor) -> dict[str, Tensor]:
-        """Returns the unweighted terms of the Gaussians whose weight is not 0; ``size [G]``: initial largest sides."""
+    def of_gaussians(self, gaussians: Gaussians, size: Tensor, seen: Tensor) -> dict[str, Tensor]:
+        """Returns the unweighted terms of the Gaussians whose weight is not 0.
+
+        Args:
+            gaussians: the G Gaussians.
+            size: ``[G]`` initial largest standard deviations.
+            seen: ``[G]`` weights of their opacities in [0, 1].
+        """
         terms: dict[str, Tensor] = {}
         if self.opacity:
-            terms["opacity"] = gaussians.opacities.mean()
+            terms["opacity"] = (seen * gaussians.opacities).mean()
         if self.scale:
             terms["scale"] = (gaussians.scales.max(-1).values / size - 1).clamp(min=0).mean()
         return terms

@@ -84,6 +84,8 @@ class Parameters:
         values: the parameters by name; those of Gaussians have one row each.
         unit: ``[G]`` unit in which positions move.
         size: ``[G]`` largest standard deviations at the start.
+        seen: ``[G]`` 1 for Gaussians that trained views show, else 0: nothing but the penalty on opacity would reach
+            the others, and remove them. 1 for all at first.
         moments: Adam's two moments by name; ``counts`` are the numbers of updates they hold, ``[G]`` or one number.
     """
 
@@ -93,6 +95,7 @@ class Parameters:
         self.pixel, self.depth, self.trained = pixel, depth, trained.to(gaussians.means.device)
         self.unit = gaussians.scales.median(-1).values
         self.size = gaussians.scales.max(-1).values
+        self.seen = torch.ones_like(self.size)
         self.values = {
             "means": gaussians.means.clone(),
             "quats": F.normalize(gaussians.quats, dim=-1),
@@ -232,11 +235,12 @@ class Parameters:
 
     def _replace(self, change: Callable[[Tensor], Tensor]) -> None:
         """Applies a change of rows to all that is known of the Gaussians."""
-        unit, size, counts = change(self.unit), change(self.size), change(self.counts)
+        unit, size, seen, counts = (change(each) for each in (self.unit, self.size, self.seen, self.counts))
         values = self.values | {name: change(self.values[name]) for name in OF_GAUSSIANS}
         moments = self.moments | {name: _both(change, self.moments[name]) for name in OF_GAUSSIANS}
         # at once, because Ctrl-C during the copies must leave a scene that fits together
-        self.unit, self.size, self.counts, self.values, self.moments = unit, size, counts, values, moments
+        self.unit, self.size, self.seen, self.counts = unit, size, seen, counts
+        self.values, self.moments = values, moments
 
 
 def _both(change: Callable[[Tensor], Tensor], moments: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:

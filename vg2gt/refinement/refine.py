@@ -14,6 +14,7 @@ from torch import Tensor
 from vg2gt.losses.gaussian import where_it_counts
 from vg2gt.metrics import psnr
 from vg2gt.refinement.density import fill_holes, supported, with_points
+from vg2gt.refinement.growth import shown
 from vg2gt.refinement.options import Observations, Observer, Progress, RefineLoss, RefineOptions
 from vg2gt.refinement.parameters import Parameters, RefinedScene
 from vg2gt.refinement.photographs import Photographs
@@ -207,6 +208,10 @@ class _Refinement:
             filled = fill_holes(begun.gaussians, cameras, seen, renderer, self.trained, options.fill, room)
             begun = replace(begun, gaussians=filled)
         self.parameters = Parameters(begun, options.rates, self.pixel, self.depth, self.trained)
+        if loss.opacity and len(self.trained) < len(views):
+            self.parameters.seen = shown(
+                begun.gaussians, cameras.select(self.trained.to(cameras.intrinsics.device)), renderer
+            )
 
     def run(self, observe: Observer | None) -> Refined:
         """Runs steps and checks until the refinement ends."""
@@ -251,7 +256,7 @@ class _Refinement:
         of_step = self.options.loss.with_geometry(0 if self.steps % every else every)
         view = self.order.deal().to(self.seen.images.device)
         loss, images = view_loss(scene, self.seen, self.renderer, of_step, view, self.depth)
-        if terms := of_step.of_gaussians(scene.gaussians, self.parameters.size):
+        if terms := of_step.of_gaussians(scene.gaussians, self.parameters.size, self.parameters.seen):
             loss = loss + of_step.total(terms)
         self.recent.append(float(images.mean()))
         self.steps += 1

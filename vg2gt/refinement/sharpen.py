@@ -14,7 +14,7 @@ from torch import Tensor
 from vg2gt.losses.gaussian import where_it_counts
 from vg2gt.metrics import psnr
 from vg2gt.refinement.exposure import log_exposures
-from vg2gt.refinement.growth import in_front, remove_idle, split_large
+from vg2gt.refinement.growth import in_front, remove_idle, shown, split_large
 from vg2gt.refinement.options import FullSizeOptions, Observations, Observer, Progress, RefineLoss, RefineOptions
 from vg2gt.refinement.parameters import Parameters, RefinedScene
 from vg2gt.refinement.photographs import Crop, CropOrder, Photographs, whole_views
@@ -130,6 +130,7 @@ class _Sharpening:
         rates = replace(rates, means=self.full.rate * rates.means, sh=self.full.rate * rates.sh)
         self.early = trained[~torch.isin(trained, self.fold)]
         self.parameters = Parameters(start, rates, 1 / focal, self.depth, self.early)
+        self._note_seen(self.early)
         self.limit = _most_steps(self.full, photographs, len(trained), seconds)
         self.open = not len(self.fold)
         self.order = self._order()
@@ -137,6 +138,15 @@ class _Sharpening:
         self.steps = self.growth = self.checked = 0
         self.recent: list[float] = []
         self.scores: list[float] = []
+
+    def _note_seen(self, views: Tensor) -> None:
+        """Spares what none of ``views [N]`` shows the penalty on opacity."""
+        parameters, views = self.parameters, views.to(self.seen.images.device)
+        if len(views) == len(self.seen.images):
+            parameters.seen = torch.ones_like(parameters.seen)
+        else:
+            present = parameters.present()
+            parameters.seen = shown(present.gaussians, present.cameras.select(views), self.renderer)
 
     def run(self, observe: Observer | None) -> Sharpened:
         """Runs steps, growth and checks until the stage ends."""
@@ -185,7 +195,7 @@ class _Sharpening:
         rows = self._rows(crop)
         scene = self.parameters.scene(rows)
         rendered, image = self._terms(scene, crop, of_step)
-        if terms := of_step.of_gaussians(scene.gaussians, self.parameters.size[rows]):
+        if terms := of_step.of_gaussians(scene.gaussians, self.parameters.size[rows], self.parameters.seen[rows]):
             rendered = rendered + of_step.total(terms)
         self.recent = [*self.recent, *([image] if math.isfinite(image) else [])][-20:]
         self.steps += 1
@@ -205,9 +215,8 @@ class _Sharpening:
 
     def _rows(self, crop: Crop) -> Tensor:
         """Returns the Gaussians that a crop may show."""
-        values = self.parameters.values
-        size = values["scales"].max(-1).values.exp()
-        return in_front(size, values["means"], crop.camera(self.parameters.cameras), self.renderer.near)
+        values, camera = self.parameters.values, crop.camera(self.parameters.cameras)
+        return in_front(values["scales"], values["means"], camera, self.renderer.near)
 
     def _terms(self, scene: RefinedScene, crop: Crop, loss: RefineLoss) -> tuple[Tensor, float]:
         """Returns the loss of one crop, and its PSNR in dB; NaN if it is masked as a whole."""
@@ -230,6 +239,7 @@ class _Sharpening:
         """Trains all views from now on; the exposures of those left out so far start as the scene suggests."""
         self.open = True
         self.order = self._order()
+        self._note_seen(self.views)
         if self.parameters.rates["gain"]:
             scene, fold = self.parameters.scene().detach(), self.fold.to(self.seen.images.device)
             cameras = replace(self.poses, world_to_camera=scene.cameras.world_to_camera).select(fold)
