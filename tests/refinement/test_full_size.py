@@ -172,7 +172,11 @@ def test_detail_appears_that_the_working_size_does_not_show(
 
 @pytest.mark.parametrize(
     ("course", "ended"),
-    [([20, 21, 22, 21, 21, 21, 21], "overfitting"), ([20, 19, 19, 19], "no gain"), ([20, 21, 22, 23, 24], "steps")],
+    [
+        ([20, 22, 23, 21, 21, 21, 21], "overfitting"),
+        ([20, 19, 19, 19], "no gain"),
+        ([20, 22, 21.5, 21.6, 21.5], "steps"),
+    ],
 )
 def test_left_out_views_decide_when_it_ends(
     begin: RefinedScene, start: Start, photographs: Photographs, monkeypatch, course, ended

@@ -238,7 +238,7 @@ class FullSizeOptions:
     grow_every: int = 150
     grow_until: float = 0.4
     fold: int = 16
-    opened: float = 0.7
+    opened: float = 0.5
     geometry_every: int = 8
     sh_degree: int | None = 2
 
