@@ -174,7 +174,8 @@ def test_detail_appears_that_the_working_size_does_not_show(
     ("course", "ended"),
     [
         ([20, 22, 23, 21, 21, 21, 21], "overfitting"),
-        ([20, 19, 19, 19], "no gain"),
+        ([20, 18, 18, 18], "no gain"),
+        ([20, 19.2, 19.2, 19.2], "overfitting"),
         ([20, 22, 21.5, 21.6, 21.5], "steps"),
     ],
 )

@@ -10,10 +10,11 @@ import torch
 from tests.refinement.conftest import VIEWS, Start, run
 from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.refinement import Refined, RefinedScene, RefineLoss, RefineOptions, RefineRates
-from vg2gt.refinement.density import GROWTH, merged, supported
+from vg2gt.refinement.density import GROWTH, merged, supported, uncovered
 from vg2gt.refinement.growth import contributions
 from vg2gt.refinement.options import Progress
 from vg2gt.types import Gaussians
+from vg2gt.visibility import count_points
 
 COLOUR = RefineLoss(depth_consistency=0, normal_render=0, normal_decoded=0)
 
@@ -157,7 +158,7 @@ def test_what_two_views_support_starts_coarse(start: Start) -> None:
     """Few wide Gaussians take the place of the many that only two views agree on; the others are untouched."""
     gaussians, cameras, depth = start.gaussians, start.cameras, start.seen.depth
     strong, weak = (supported(gaussians, cameras, depth, views) for views in (3, 2))
-    found = supported(gaussians, cameras, depth, 3, merge_cells=8.0)
+    found = supported(gaussians, cameras, depth, 3, 8.0, start.renderer)
     assert torch.equal(found.means[: len(strong)], strong.means)
     coarse = found.select(torch.arange(len(strong), len(found)))
     assert 0 < len(coarse) < 0.5 * (len(weak) - len(strong))
@@ -168,6 +169,22 @@ def test_what_two_views_support_starts_coarse(start: Start) -> None:
     # two steps do not make up for the fewer Gaussians: the scene that was given comes back
     assert (refined.step, len(refined.scene.gaussians)) == (0, len(gaussians))
     assert torch.equal(refined.psnr[0], refined.psnr[1])
+
+
+def test_what_a_single_view_shows_is_kept_where_nothing_else_would_be(start: Start) -> None:
+    """The ground before one camera, of which no other view knows the depth."""
+    depth = start.seen.depth.clone()
+    depth[1:, depth.shape[1] // 2 :] = 0
+    agree, _ = count_points(start.gaussians.means, depth, start.cameras, 0.03, 0.05)
+    first, _ = count_points(start.gaussians.means, depth[:1], start.cameras.select(slice(0, 1)), 0.03, 0.05)
+    own = (first > 0) & (agree == 1)
+    parts = (start.gaussians, start.cameras, depth, 3, 8.0)
+    without, found = supported(*parts), supported(*parts, start.renderer)
+    holes = uncovered(without, start.cameras, depth, start.renderer)[0] > 0
+    assert own.sum() > 100
+    assert len(found) > len(without)
+    assert len(found) - len(without) < 0.5 * own.sum()  # merged
+    assert (uncovered(found, start.cameras, depth, start.renderer)[0] > 0).sum() < 0.5 * holes.sum()
 
 
 def test_merged_gaussians_have_the_moments_of_their_mixture() -> None:

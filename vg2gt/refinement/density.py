@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 from scipy.spatial import KDTree
@@ -30,11 +31,21 @@ POINT = 0.5  # its opacity
 FILLED = 0.9  # opacity of a Gaussian in a hole: high enough to cover its block, low enough to be pruned if it is wrong
 
 
-def supported(gaussians: Gaussians, cameras: Cameras, depth: Tensor, views: int, merge_cells: float = 0.0) -> Gaussians:
+def supported(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    depth: Tensor,
+    views: int,
+    merge_cells: float = 0.0,
+    renderer: Renderer | None = None,
+) -> Gaussians:
     """Returns the Gaussians that enough views agree with and no more look through; all if there are none.
 
     Depth without texture is unreliable, and with many views some of its errors agree by chance. Refined as they are,
     such small Gaussians fit their source views and become floaters in all others; merged, they become smooth.
+
+    What a single view agrees with is merged, too, where this view would otherwise show nothing or the background:
+    otherwise the ground near the first and the last camera of a walk is lost.
 
     Args:
         gaussians: the scene (B = 1).
@@ -43,6 +54,7 @@ def supported(gaussians: Gaussians, cameras: Cameras, depth: Tensor, views: int,
         views: minimum number of views that agree, capped at half of V.
         merge_cells: merge Gaussians that fewer, but at least two views agree with, in cells this many times as wide as
             what the median Gaussian covers; 0: remove them.
+        renderer: renderer that decides where a view would show nothing; None: do not ask.
     """
     agree, through = count_points(gaussians.means, depth, cameras, TOLERANCE, MARGIN)
     far = is_far(gaussians, depth, cameras)  # the far shell behind everything stays
@@ -51,10 +63,32 @@ def supported(gaussians: Gaussians, cameras: Cameras, depth: Tensor, views: int,
     if not keep.any():
         return gaussians
     kept = gaussians.select(keep)
+    if merge_cells and renderer is not None:
+        alone = uncovered(gaussians.select(keep | weak), cameras, depth, renderer)
+        agree_there, _ = count_points(gaussians.means, alone, cameras, TOLERANCE, MARGIN)
+        weak |= (agree_there > 0) & (through <= agree) & ~keep
     if not merge_cells or not weak.any():
         return kept
     sizes = gaussians.scales[~far].max(-1).values
     return kept.joined(merged(gaussians.select(weak), merge_cells * float(sizes.median()) / ALONE))
+
+
+@torch.no_grad()
+def uncovered(gaussians: Gaussians, cameras: Cameras, depth: Tensor, renderer: Renderer) -> Tensor:
+    """Returns the depth ``[V, H, W]`` of the pixels at which a scene shows nothing, or what is far behind; 0 elsewhere.
+
+    Args:
+        gaussians: the scene (B = 1).
+        cameras: cameras of its V views (B = 1).
+        depth: ``[V, H, W]`` depth of the views, 0 = unknown.
+        renderer: renderer of the scene.
+    """
+    with_depth, left = replace(renderer, geometry=True), torch.zeros_like(depth)
+    for view, own in enumerate(depth):
+        shown = with_depth(gaussians, cameras.select(slice(view, view + 1)))
+        behind = shown.depth[0, 0] > (1 + 2 * MARGIN) * own
+        left[view] = torch.where(behind | (shown.alpha[0, 0] < COVERED), own, 0.0)
+    return left
 
 
 def merged(gaussians: Gaussians, cell: float) -> Gaussians:

@@ -280,7 +280,8 @@ class RefineOptions:
         min_views: remove Gaussians at the start if fewer views' depth agrees with them, or more views look through them
             than agree: Gaussians that a single view supports overfit it. 0: keep all.
         merge_cells: merge Gaussians at the start if at least two, but fewer than ``min_views``, views agree with them,
-            in cells this many times as wide as what the median Gaussian covers. 0: remove them.
+            in cells this many times as wide as what the median Gaussian covers; so are those that a single view agrees
+            with, where it would otherwise show nothing or the background. 0: remove them.
         geometry_every: render depth and normals in every N-th step only, where the terms that need them count N times;
             rendering colour alone is twice as fast. If N > 1, states are compared by colour alone.
         seed: random seed of the view order.

@@ -184,7 +184,7 @@ class _Refinement:
         self.scoring = loss if self.options.geometry_every == 1 else loss.with_geometry(0)  # renders twice as fast
         start = gaussians
         if options.min_views:
-            start = supported(gaussians, cameras, seen.depth, options.min_views, options.merge_cells)
+            start = supported(gaussians, cameras, seen.depth, options.min_views, options.merge_cells, renderer)
         visible = seen.depth[seen.depth > 0]
         self.depth = float(visible.median()) if len(visible) else 1.0
         self.pixel = 1 / float(cameras.intrinsics[..., [0, 1], [0, 1]].mean())

@@ -28,7 +28,8 @@ SCORED = 3  # maximum number of left-out views
 APART = 20  # minimum number of steps between two checks
 CHECKS = 8  # number of times that left-out views are scored
 SMOOTH = 3  # number of checks to average: a single view varies by half a dB from check to check
-NOTICED = 0.4  # dB below the best average at which the stage ends; at 0.1 a set stopped early and lost 0.3 dB
+NOTICED = 0.4  # dB below the best average at which the stage becomes shorter; at 0.1, a set lost 0.3 dB by chance
+REJECTED = 1.0  # dB below the start at which the stage is given up; at 0.1, a set lost 2.5 dB by chance
 # size of the photographs, in working sizes, from which the stage begins at half of it and compensates opacities
 LARGE = 2.5
 
@@ -277,7 +278,7 @@ class _Sharpening:
         last = range(1, len(self.scores) + 1)
         smooth = [sum(self.scores[:n][-SMOOTH:]) / min(n, SMOOTH) for n in last]
         worse = len(smooth) > SMOOTH and smooth[-1] < max(smooth) - NOTICED
-        if worse and smooth[0] == max(smooth):
+        if worse and smooth[-1] < smooth[0] - REJECTED and smooth[0] == max(smooth):
             return "no gain"
         if worse:
             self.stretch = self._raw() / self.full.opened
