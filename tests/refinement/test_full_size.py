@@ -170,6 +170,22 @@ def test_detail_appears_that_the_working_size_does_not_show(
     assert torch.equal(again.scene.gaussians.means, found.scene.gaussians.means)
 
 
+def test_no_gaussian_becomes_thinner_than_the_pixels_show(
+    begin: RefinedScene, start: Start, photographs: Photographs
+) -> None:
+    cameras = photographs.cameras(start.cameras)
+
+    def thin(thinnest: float) -> float:  # share of the Gaussians that are thinner than half a pixel
+        full = FullSizeOptions(steps=12, crop=400, grow_until=0.0, coarse=0.0, least=0.0, fold=0, thinnest=thinnest)
+        options = RefineOptions(full=full, sh_degree=0)
+        found = sharpen(begin, photographs, start.seen, start.renderer, options).scene.gaussians
+        pixels = footprints(found.means, cameras, NEAR)
+        return float((found.scales.min(-1).values * pixels)[pixels > 0].lt(0.5).float().mean())
+
+    assert thin(0.0) > 0.2
+    assert thin(0.55) < 0.02
+
+
 @pytest.mark.parametrize(
     ("course", "ended"),
     [

@@ -215,6 +215,8 @@ class FullSizeOptions:
         max_gaussians: no Gaussian is split if there would be more.
         footprint: standard deviation in pixels above which a Gaussian is split.
         least: contribution below which a Gaussian is removed, in pixels of a view of 280.
+        thinnest: smallest standard deviation in pixels of the view that sees a Gaussian best; 0: any. Smaller ones
+            show details that no photograph has, as needles (Yu et al., Mip-Splatting, 2024: its 3D smoothing filter).
         grow_every: number of steps between splits.
         grow_until: share of the stage after which no Gaussian is split.
         fold: leave out one view of this many at first; 0: none. Fewer than six views are never left out.
@@ -235,6 +237,7 @@ class FullSizeOptions:
     max_gaussians: int = 400_000
     footprint: float = 3.0
     least: float = 0.3
+    thinnest: float = 0.3
     grow_every: int = 150
     grow_until: float = 0.4
     fold: int = 16
@@ -253,6 +256,7 @@ class FullSizeOptions:
             ("max_gaussians", self.max_gaussians >= 1, "at least 1"),
             ("footprint", self.footprint > 0, "positive"),
             ("least", self.least >= 0, "at least 0"),
+            ("thinnest", self.thinnest >= 0, "at least 0"),
             ("grow_every", self.grow_every >= 1, "at least 1"),
             ("grow_until", 0 <= self.grow_until <= 1, "in [0, 1]"),
             ("fold", self.fold == 0 or self.fold >= 2, "0 or at least 2"),

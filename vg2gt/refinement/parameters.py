@@ -86,6 +86,7 @@ class Parameters:
         size: ``[G]`` largest standard deviations at the start.
         seen: ``[G]`` 1 for Gaussians that trained views show, else 0: nothing but the penalty on opacity would reach
             the others, and remove them. 1 for all at first.
+        least: ``[G]`` logarithm of the smallest standard deviation that a step may reach; -inf for all at first.
         moments: Adam's two moments by name; ``counts`` are the numbers of updates they hold, ``[G]`` or one number.
     """
 
@@ -96,6 +97,7 @@ class Parameters:
         self.unit = gaussians.scales.median(-1).values
         self.size = gaussians.scales.max(-1).values
         self.seen = torch.ones_like(self.size)
+        self.least = torch.full_like(self.size, -math.inf)
         self.values = {
             "means": gaussians.means.clone(),
             "quats": F.normalize(gaussians.quats, dim=-1),
@@ -190,6 +192,7 @@ class Parameters:
                 unit = self.unit if name == "means" else value.new_ones(len(value))
                 which = of_gaussians if name in OF_GAUSSIANS else of_views
                 update_rows(RowUpdate(value, moments, grad, *which, unit, BETAS, EPSILON, rate))
+        self.values["scales"][rows] = self.values["scales"][rows].maximum(self.least[rows, None])
         return True
 
     @torch.no_grad()
@@ -235,11 +238,12 @@ class Parameters:
 
     def _replace(self, change: Callable[[Tensor], Tensor]) -> None:
         """Applies a change of rows to all that is known of the Gaussians."""
-        unit, size, seen, counts = (change(each) for each in (self.unit, self.size, self.seen, self.counts))
+        known = (self.unit, self.size, self.seen, self.least, self.counts)
+        unit, size, seen, least, counts = map(change, known)
         values = self.values | {name: change(self.values[name]) for name in OF_GAUSSIANS}
         moments = self.moments | {name: _both(change, self.moments[name]) for name in OF_GAUSSIANS}
         # at once, because Ctrl-C during the copies must leave a scene that fits together
-        self.unit, self.size, self.seen, self.counts = unit, size, seen, counts
+        self.unit, self.size, self.seen, self.least, self.counts = unit, size, seen, least, counts
         self.values, self.moments = values, moments
 
 

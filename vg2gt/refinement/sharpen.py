@@ -14,7 +14,7 @@ from torch import Tensor
 from vg2gt.losses.gaussian import where_it_counts
 from vg2gt.metrics import psnr
 from vg2gt.refinement.exposure import log_exposures
-from vg2gt.refinement.growth import in_front, remove_idle, shown, split_large
+from vg2gt.refinement.growth import footprints, in_front, remove_idle, shown, split_large
 from vg2gt.refinement.options import FullSizeOptions, Observations, Observer, Progress, RefineLoss, RefineOptions
 from vg2gt.refinement.parameters import Parameters, RefinedScene
 from vg2gt.refinement.photographs import Crop, CropOrder, Photographs, whole_views
@@ -254,6 +254,8 @@ class _Sharpening:
         for factor in (1.5, 1.5) if twice else (1.0,):
             pixels = factor * self.full.footprint
             self.growth += split_large(self.parameters, cameras, self.renderer.near, pixels, self.full.max_gaussians)
+        seen = footprints(self.parameters.values["means"], cameras, self.renderer.near)
+        self.parameters.least = torch.where(seen > 0, (self.full.thinnest / seen).log(), -math.inf)
 
     @torch.no_grad()
     def _score(self) -> float:
