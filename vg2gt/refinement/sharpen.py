@@ -28,8 +28,8 @@ SCORED = 3  # maximum number of left-out views
 APART = 20  # minimum number of steps between two checks
 CHECKS = 8  # number of times that left-out views are scored
 SMOOTH = 3  # number of checks to average: a single view varies by half a dB from check to check
-NOTICED = 0.4  # dB below the best average at which the stage becomes shorter; at 0.1, a set lost 0.3 dB by chance
-REJECTED = 1.0  # dB below the start at which the stage is given up; at 0.1, a set lost 2.5 dB by chance
+NOTICED = 0.7  # dB below the best average at which the stage becomes shorter; at 0.1, a set lost 0.3 dB by chance
+REJECTED = 1.5  # dB below the start at which the stage is given up; at 0.1, a set lost 2.5 dB by chance
 # size of the photographs, in working sizes, from which the stage begins at half of it and compensates opacities
 LARGE = 2.5
 
