@@ -9,10 +9,19 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from vg2gt.monitor import Monitor
-from vg2gt.reconstruction.photographs import load_photographs, sparse_points
+from vg2gt.reconstruction.photographs import full_size, load_photographs, sparse_points
 from vg2gt.reconstruction.policy import Quality, Refinement, chosen_refinement
 from vg2gt.reconstruction.surroundings import without_debris
-from vg2gt.refinement import Observations, RefineOptions, exposure_rates, fold_of, refine, sharpened, split_views
+from vg2gt.refinement import (
+    FullSizeOptions,
+    Observations,
+    RefineOptions,
+    exposure_rates,
+    fold_of,
+    refine,
+    sharpened,
+    split_views,
+)
 from vg2gt.refinement.options import Observer, Progress
 from vg2gt.refinement.parameters import RefinedScene
 from vg2gt.types import Cameras, Gaussians
@@ -26,6 +35,7 @@ log = logging.getLogger(__name__)
 
 USABLE = 17.0  # dB; scenes below it look like fog
 WORKING_SHARE = 0.45  # of the time, at most, for the stage at the working size
+LARGER = 1.25  # factor from the working size to that of the photographs from which these are refined on their own
 
 
 def refine_scene(
@@ -50,7 +60,7 @@ def refine_scene(
     seen = Observations(scene.images, scene.depth, scene.depth_conf, scene.mask).to(device)
     rates = exposure_rates(options.rates, scene.gaussians, scene.cameras, seen, scene.renderer)
     options = replace(options, rates=rates)
-    full = options.full if scene.pictures else None
+    full = _of_full_size(scene, options)
     at_working_size = options
     if full is not None and options.seconds is not None:
         at_working_size = replace(options, seconds=WORKING_SHARE * options.seconds)
@@ -79,6 +89,14 @@ def refine_scene(
         renderer=scene.renderer if refined.sharpened is None else refined.sharpened.renderer,
     )
     return without_debris(made)
+
+
+def _of_full_size(scene: Scene, options: RefineOptions) -> FullSizeOptions | None:
+    """Returns the options of the second stage; None without one, or if the photographs show no more than the views."""
+    if options.full is None or not scene.pictures:
+        return None
+    size = full_size(scene.pictures, scene.cameras.size, options.full.size)
+    return options.full if max(size) >= LARGER * max(scene.cameras.size) else None
 
 
 def refined_by_policy(
