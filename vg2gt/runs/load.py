@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import inspect
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -15,6 +16,7 @@ from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from backends.published import NETWORKS
 from vg2gt.config import compose, compose_groups, flatten
 from vg2gt.io.tensors import tensors_digest
 from vg2gt.model import Reconstructor
@@ -193,15 +195,27 @@ def refuse_other_tokens(backend: Any, checkpoint: Mapping[str, Any], path: Path)
     if not isinstance(text, str):
         return
     stored = parse_run_config(text, f"{path}: {MADE_OF}").get("backend")
-    here, there = (flatten(OmegaConf.to_container(OmegaConf.create(part or {}))) for part in (backend, stored))
-    if here.get("_target_") != there.get("_target_"):
+    own, other = (OmegaConf.to_container(OmegaConf.create(part or {})) for part in (backend, stored))
+    if own.get("_target_") != other.get("_target_"):  # pyright: ignore[reportAttributeAccessIssue]
         return  # another network, which the hash of the weights reveals, or the same network as an ONNX bundle
+    here, there = (flatten(_with_defaults(part)) for part in (own, other))
     for key in sorted(here.keys() & there.keys()):
         if key.rpartition(".")[2] in TOKENS and here[key] != there[key]:
             raise ValueError(
                 f"{path} was trained with backend.{key}={there[key]}, but this run uses {here[key]}: use the same "
                 "value, or start a new run from these weights with init_from="
             )
+
+
+def _with_defaults(backend: Any) -> Any:
+    """Options of a backend, with the defaults of its constructor and the shape of its network where it names none."""
+    if not isinstance(backend, dict):
+        return list(backend) if isinstance(backend, tuple) else backend
+    if "_target_" in backend:
+        parameters = inspect.signature(get_class(backend["_target_"])).parameters.items()
+        defaults = {name: each.default for name, each in parameters if each.default is not each.empty}
+        backend = defaults | NETWORKS.get(backend.get("name", defaults.get("name")), {}) | backend
+    return {key: _with_defaults(value) for key, value in backend.items()}
 
 
 def earlier_configs(path: Path) -> list[Path]:
