@@ -10,7 +10,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from vg2gt.config import config_dir
+from vg2gt.config import config_dir, variants
 from vg2gt.evaluation.checks import refuse_training_views
 from vg2gt.runs.checkpoints import MADE_OF
 from vg2gt.runs.load import load_model
@@ -141,3 +141,5 @@ def test_everything_of_the_projects_configurations_is_trusted() -> None:
         assert files
         for path in files:
             check_targets(OmegaConf.load(path), path)
+        for name, option in variants().get(group, {}).items():
+            check_targets(OmegaConf.create(option), name)

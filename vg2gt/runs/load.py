@@ -93,7 +93,7 @@ def load_model(
         ckpt: a checkpoint or a run's folder. None loads the weights that ship with the package (:data:`SHIPPED`), or
             with another backend than ``sweep``, or ``backend=sweep`` with options that change what it computes, the
             untrained head of ``model=tiny_ungated`` (``oracle``: ``tiny``), which predicts coloured voxels.
-        backend: a name in ``configs/backend``, short for the override ``backend=NAME``; None keeps the run's backend.
+        backend: an option of ``backend=``, short for the override ``backend=NAME``; None keeps the run's backend.
         overrides: command-line overrides. ``backend=NAME``, ``model=NAME`` and ``renderer=NAME`` replace a part of the
             run's configuration; ``backend.key=value`` and the like change one key.
         device: ``auto``, ``cpu``, ``cuda`` or ``cuda:N``.
