@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass, fields
 from typing import Any
 
 from backends.vit import FeedForward
@@ -32,7 +32,7 @@ class Network:
         prefix: prefix of DA3's names in the file.
     """
 
-    licence: str
+    licence: str = "unknown"
     repo: str | None = None
     dim: int
     depth: int
@@ -90,5 +90,12 @@ NETWORKS: dict[str, dict[str, Any]] = {
 
 
 def network_named(name: str, given: dict[str, Any]) -> Network:
-    """Returns the network of a name, with ``given`` instead of its attributes; other names need all of them."""
-    return Network(**NETWORKS.get(name, {}) | given)
+    """Returns the network of a name in :data:`NETWORKS`, with ``given`` instead of its attributes.
+
+    Raises:
+        ValueError: if the name is unknown and ``given`` does not have all of a network's shape.
+    """
+    known = NETWORKS.get(name, {}) | given
+    if missing := [each.name for each in fields(Network) if each.default is MISSING and each.name not in known]:
+        raise ValueError(f"backend.name={name} is none of {', '.join(NETWORKS)}: give its {', '.join(missing)}, too")
+    return Network(**known)

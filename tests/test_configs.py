@@ -217,8 +217,8 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "backends.da3.DA3MetricBackend": {"revision": None, "seed": 0},
     "backends.vggt.VGGTBackend": {"revision": None, "seed": 0},
     "backends.published.Network": {
-        "encoder_depth": 24, "ffn": "mlp", "multiview_from": None, "camera_depth": 4, "camera_heads": 16,
-        "image_size": 518, "patch_size": 14, "prefix": "model.",
+        "licence": "unknown", "repo": None, "encoder_depth": 24, "ffn": "mlp", "multiview_from": None,
+        "camera_depth": 4, "camera_heads": 16, "image_size": 518, "patch_size": 14, "prefix": "model.",
     },
 }  # fmt: skip
 

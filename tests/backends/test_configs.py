@@ -44,6 +44,10 @@ def test_other_shapes_and_unknown_attributes(make_backend) -> None:
     assert make_backend("da3_tiny", "depth=4", "multiview_from=1", "taps=[0,1,2,3]").taps == (0, 1, 2, 3)
     with pytest.raises(Exception, match="unexpected keyword argument 'width'"):
         make_backend("da3_tiny", "width=4")
+    with pytest.raises(
+        Exception, match=r"backend\.name=mine is none of da3_small.*: give its dim, depth, num_heads, taps"
+    ):
+        make_backend("da3_tiny", "name=mine")
 
 
 def test_custom_takes_any_class(make_backend) -> None:
