@@ -203,7 +203,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "vg2gt.data.RGBDFolder": {"invalid": (0, 65535)},
     "vg2gt.data.sources.Infinigen": {"max_depth": 30.0, "cameras": (0,)},
     "vg2gt.data.views.drawn.ViewSelection": {"index": None, "targets": 4, "seed": 0},
-    "vg2gt.evaluation.evaluator.EvaluationOptions": {"neighbors": 8},
+    "vg2gt.evaluation.evaluator.EvaluationOptions": {"depth_range": (None, None), "neighbors": 8},
     "vg2gt.evaluation.evaluator.PointOptions": {"threshold": 0.05, "downsample": 0.02, "cap": None},
     "vg2gt.training.memory.ReturnFreeMemory": {"growth_mb": 600},
     "vg2gt.training.module.VG2GTModule": {"rasterized_depth": False, "max_skipped": 20},

@@ -195,10 +195,10 @@ def refuse_other_tokens(backend: Any, checkpoint: Mapping[str, Any], path: Path)
     if not isinstance(text, str):
         return
     stored = parse_run_config(text, f"{path}: {MADE_OF}").get("backend")
-    own, other = (OmegaConf.to_container(OmegaConf.create(part or {})) for part in (backend, stored))
-    if own.get("_target_") != other.get("_target_"):  # pyright: ignore[reportAttributeAccessIssue]
+    parts: list[Any] = [OmegaConf.to_container(OmegaConf.create(part or {})) for part in (backend, stored)]
+    if parts[0].get("_target_") != parts[1].get("_target_"):  # compared first, as defaults import the class
         return  # another network, which the hash of the weights reveals, or the same network as an ONNX bundle
-    here, there = (flatten(_with_defaults(part)) for part in (own, other))
+    here, there = (flatten(_with_defaults(part)) for part in parts)
     for key in sorted(here.keys() & there.keys()):
         if key.rpartition(".")[2] in TOKENS and here[key] != there[key]:
             raise ValueError(
@@ -214,7 +214,8 @@ def _with_defaults(backend: Any) -> Any:
     if "_target_" in backend:
         parameters = inspect.signature(get_class(backend["_target_"])).parameters.items()
         defaults = {name: each.default for name, each in parameters if each.default is not each.empty}
-        backend = defaults | NETWORKS.get(backend.get("name", defaults.get("name")), {}) | backend
+        named = str(backend.get("name", defaults.get("name")))
+        backend = defaults | NETWORKS.get(named, {}) | backend
     return {key: _with_defaults(value) for key, value in backend.items()}
 
 
