@@ -196,7 +196,8 @@ def refuse_other_tokens(backend: Any, checkpoint: Mapping[str, Any], path: Path)
         return
     stored = parse_run_config(text, f"{path}: {MADE_OF}").get("backend")
     parts: list[Any] = [OmegaConf.to_container(OmegaConf.create(part or {})) for part in (backend, stored)]
-    if parts[0].get("_target_") != parts[1].get("_target_"):  # compared first, as defaults import the class
+    own, other = ({k: v for k, v in flatten(part).items() if k.endswith("_target_")} for part in parts)
+    if own != other:  # compared before any of the checkpoint's classes is imported
         return  # another network, which the hash of the weights reveals, or the same network as an ONNX bundle
     here, there = (flatten(_with_defaults(part)) for part in parts)
     for key in sorted(here.keys() & there.keys()):
