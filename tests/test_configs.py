@@ -198,7 +198,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "vg2gt.losses.GaussianLoss": {"confidence_weighted": True, "min_alpha": 0.5},
     "vg2gt.refinement.FullSizeOptions": {
         "renderings": 40.0, "coarse": 0.5, "rate": 0.5, "least": 0.3, "grow_every": 150, "grow_until": 0.4,
-        "opened": 0.7, "geometry_every": 8,
+        "opened": 0.5, "geometry_every": 8,
     },
     "vg2gt.data.RGBDFolder": {"invalid": (0, 65535)},
     "vg2gt.data.sources.Infinigen": {"max_depth": 30.0, "cameras": (0,)},
