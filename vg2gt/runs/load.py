@@ -213,11 +213,17 @@ def _with_defaults(backend: Any) -> Any:
     if not isinstance(backend, dict):
         return list(backend) if isinstance(backend, tuple) else backend
     if "_target_" in backend:
-        parameters = inspect.signature(get_class(backend["_target_"])).parameters.items()
-        defaults = {name: each.default for name, each in parameters if each.default is not each.empty}
+        defaults = constructor_defaults(backend["_target_"])
         named = str(backend.get("name", defaults.get("name")))
         backend = defaults | NETWORKS.get(named, {}) | backend
     return {key: _with_defaults(value) for key, value in backend.items()}
+
+
+def constructor_defaults(target: str) -> dict[str, Any]:
+    """Returns the arguments of a class with a default, tuples as lists; imports the class."""
+    parameters = inspect.signature(get_class(target)).parameters.items()
+    known = {name: each.default for name, each in parameters if each.default is not each.empty}
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in known.items()}
 
 
 def earlier_configs(path: Path) -> list[Path]:
