@@ -62,24 +62,15 @@ class NetworkBackend(Backend):
     They pass it ``make``, which builds the network, and :class:`Weights`; ``properties`` are those of :class:`Backend`.
 
     Args:
-        name: name in checkpoints and messages.
-        licence: licence of the weights.
-        dim: channels C of the blocks.
-        num_heads: attention heads.
-        taps: indices of four blocks (VGGT: pairs of blocks) whose tokens feed the heads, ascending.
-        features: channels of the DPT's fusion stages.
-        out_channels: DPT channels of the four taps.
-        image_size: native image edge.
-        patch_size: edge of a patch in pixels.
+        name: name in checkpoints and messages, and of the network in :data:`backends.published.NETWORKS`.
         pretrained: whether to load weights, otherwise random ones.
-        repo: Hugging Face repository of the weights.
         revision: branch, tag or commit of the repository.
         path: local weight file or folder, instead of the repository.
-        prefix: prefix of the names in the file.
         seed: seed of random weights.
         head_chunk: maximum number of views to decode at a time; None decodes all at once.
         freeze: whether to freeze the network. Otherwise all of it except the camera head is trained, and checkpoints
             include it. Cameras and initial geometry are treated as constants.
+        shape: attributes of :class:`backends.published.Network` that differ from those of the name.
     """
 
     network: Any

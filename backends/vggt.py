@@ -15,6 +15,7 @@ from torch.nn import functional as F
 from backends.dpt import DPT, decode_geometry
 from backends.network import NetworkBackend, decode_pose, normalize_images, predict
 from backends.positions import grid_positions, resize_position_embedding, rotary_2d
+from backends.published import network_named
 from backends.vit import PatchEmbed, ViTBlock, ViTMLP, first_and_others
 from backends.weights import Weights
 from vg2gt.geometry.precision import full_precision, half_precision_on_gpu
@@ -181,11 +182,7 @@ class _VGGTNetwork(VGGTDecoder):
 class VGGTBackend(NetworkBackend):
     """VGGT (Wang et al., 2025): relative geometry in the frame of the first view. Ignores hints.
 
-    Args (for the others see :class:`NetworkBackend`; tokens have 2C channels):
-        depth: number of pairs of alternating blocks.
-        encoder_depth: number of blocks of the per-view encoder.
-        camera_depth: number of blocks of the camera head.
-        camera_heads: attention heads of the camera head.
+    For the arguments see :class:`NetworkBackend`; tokens have 2C channels.
     """
 
     camera_name = "camera_head"
@@ -195,35 +192,27 @@ class VGGTBackend(NetworkBackend):
     def __init__(
         self,
         name: str = "vggt_1b",
-        licence: str = "VGGT research licence",
-        dim: int = 1024,
-        depth: int = 24,
-        encoder_depth: int = 24,
-        num_heads: int = 16,
-        taps: Sequence[int] = (4, 11, 17, 23),
-        features: int = 256,
-        out_channels: Sequence[int] = (256, 512, 1024, 1024),
-        camera_depth: int = 4,
-        camera_heads: int = 16,
-        image_size: int = 518,
-        patch_size: int = 14,
         pretrained: bool = True,
-        repo: str | None = "facebook/VGGT-1B",
         revision: str | None = None,
         path: str | None = None,
         seed: int = 0,
         head_chunk: int | None = 8,
         freeze: bool = True,
+        **shape: Any,
     ) -> None:
+        net = network_named(name, shape)
+
         def make() -> _VGGTNetwork:
-            aggregator = _Aggregator(dim, depth, encoder_depth, num_heads, image_size, patch_size)
-            network = _VGGTNetwork(aggregator, features, out_channels, camera_depth, camera_heads)
+            aggregator = _Aggregator(
+                net.dim, net.depth, net.encoder_depth, net.num_heads, net.image_size, net.patch_size
+            )
+            network = _VGGTNetwork(aggregator, net.features, net.out_channels, net.camera_depth, net.camera_heads)
             # iterations add up to about the identity pose and fields of view of 1 rad
             predict(network.camera_head.pose_branch.fc2, [value / ITERATIONS for value in (0, 0, 0, 0, 0, 0, 1, 1, 1)])
             return network
 
-        weights = Weights(name, licence, pretrained, repo, revision, path, seed, ignorable=IGNORABLE)
-        super().__init__(make, weights, patch_size, 2 * dim, taps, head_chunk, freeze)
+        weights = Weights(name, net.licence, pretrained, net.repo, revision, path, seed, ignorable=IGNORABLE)
+        super().__init__(make, weights, net.patch_size, 2 * net.dim, net.taps, head_chunk, freeze)
 
     def encode_checked(self, images: Tensor, hints: Hints | None) -> Tokens:
         """See :meth:`NetworkBackend.encode_checked`."""

@@ -76,7 +76,7 @@ def prepare(
     scene = [f"data.image_size=[{height},{width}]", "data.eval_scenes=1", "data.train_scenes=1", "data.eval_target=1"]
     scene += [f"data.eval_context={views}", f"data.num_frames={views + 6}"]
     scene += [f"data.min_views={views}", f"data.max_views={views}", f"data.max_images={views}"]
-    alone = [f"trainer.accelerator={accelerator}", "trainer.devices=1", "trainer.strategy=auto"]
+    alone = [f"trainer.accelerator={accelerator}", "trainer.devices=1", "++trainer.strategy=auto"]
     run = build(compose_run([*alone, *scene, *overrides], folder))
     run.datamodule.setup("validate")
     run.module.to(device)

@@ -154,7 +154,7 @@ def _train(setting: Setting, devices: int, scenes: int, steps: int) -> tuple[flo
     overrides += [f"data.image_size={size}", f"data.min_views={views}", f"data.max_views={views}"]
     overrides += [f"data.max_images={views * scenes // devices}", f"data.train_scenes={2 * scenes}"]
     overrides += ["data.eval_scenes=1", "model.coarse.ptv3.drop_path=0", "optimizer.lr=1e-5", "training.final_lr=1e-5"]
-    overrides += [f"trainer.devices={devices}", f"trainer.max_steps={steps}", "trainer.log_every_n_steps=1"]
+    overrides += [f"trainer.devices={devices}", f"trainer.max_steps={steps}", "++trainer.log_every_n_steps=1"]
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, str(ROOT / "train.py"), "experiment=paper", "data=synthetic", *overrides]
         begin = time.monotonic()

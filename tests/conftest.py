@@ -23,7 +23,7 @@ from tests.sharing import made_once, shared_folder
 # A full collection looks at all that was imported, 0.3 s long: a third as many as by default take 4 % less in all.
 gc.set_threshold(700, 10, 100)
 
-SHALLOW = ["+backend=da3_tiny", "backend.depth=4", "backend.multiview_from=1", "backend.taps=[0,1,2,3]"]
+SHALLOW = ["+backend=da3_tiny", "+backend.depth=4", "+backend.multiview_from=1", "+backend.taps=[0,1,2,3]"]
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"

@@ -21,7 +21,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "uncertainty": {"visibility"} | BASICS,
     "model": {"visibility", "method", "backends"} | BASICS,
     "baselines": {"visibility", "model", "method", "backends"} | BASICS,
-    "runs": {"visibility", "uncertainty", "baselines", "model", "method", "rendering", "data"} | BASICS,
+    "runs": {"visibility", "uncertainty", "baselines", "model", "method", "rendering", "data", "backends"} | BASICS,
     "viewer": {"rendering"} | BASICS,
     "refinement": {"visibility", "losses", "metrics", "rendering", "method"} | BASICS,
     "evaluation": {"visibility", "uncertainty", "refinement", "runs", "model", "rendering", "metrics", "data"} | BASICS,

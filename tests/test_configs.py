@@ -18,7 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from typing_extensions import get_type_hints
 
 from tests.training_helpers import full_model, group_options
-from vg2gt.config import compose, config_dir
+from vg2gt.config import compose, config_dir, variants
 from vg2gt.geometry.precision import trainer_precision
 from vg2gt.losses import VG2GTLoss
 from vg2gt.refinement import RefineOptions
@@ -181,38 +181,44 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "vg2gt.method.CoarseModule": {"neighbors": 16, "inject": "all", "upsample": 2},
     "vg2gt.method.PTv3": {"window": 64, "norm": "layer", "legacy": False},
     "vg2gt.method.FineModule": {"coarsest_drawn": 1.0},
-    "vg2gt.method.DenseHead": {"views_per_chunk": 8},
+    "vg2gt.method.DenseHead": {
+        "features": 256, "out_channels": 128, "merge_channels": None, "finest": 4, "views_per_chunk": 8,
+    },
     "vg2gt.method.PointMLP": {"stages": 2, "window": 32},
     "vg2gt.method.GaussianHead": {"max_offset": 1.0},
     "vg2gt.baselines.PixelHead": {"max_offset": 1.0, "max_depth_residual": 0.1},
+    "vg2gt.baselines.PointCloud": {"spacing": "pixel", "width": 0.5, "opacity": 0.9},
+    "vg2gt.baselines.VoxelMerged": {"voxel_size": 0.002, "min_footprint": 3.3},
     "vg2gt.rendering.Renderer": {
-        "lowpass": 0.3, "alpha_max": 0.99, "slope_floor": 30.0, "bisections": 12, "newton_steps": 2, "geometry": True,
+        "depth": "median", "lowpass": 0.3, "alpha_max": 0.99, "slope_floor": 30.0, "bisections": 12, "newton_steps": 2,
+        "geometry": True,
     },
     "vg2gt.losses.GeometryLoss": {"depth": 1.0, "point": 1.0, "gamma": 1.0, "alpha": 0.2, "quantile": 0.98},
     "vg2gt.losses.EnhancementLoss": {"margin": 0.0, "form": "improve", "on": "total"},
     "vg2gt.losses.GaussianLoss": {"confidence_weighted": True, "min_alpha": 0.5},
     "vg2gt.refinement.FullSizeOptions": {
         "renderings": 40.0, "coarse": 0.5, "rate": 0.5, "least": 0.3, "grow_every": 150, "grow_until": 0.4,
-        "opened": 0.7, "geometry_every": 8,
+        "opened": 0.5, "geometry_every": 8,
     },
     "vg2gt.data.RGBDFolder": {"invalid": (0, 65535)},
-    "vg2gt.data.sources.Infinigen": {"max_depth": 30.0},
-    "vg2gt.data.views.drawn.ViewSelection": {"index": None, "seed": 0},
-    "vg2gt.evaluation.evaluator.EvaluationOptions": {"neighbors": 8},
-    "vg2gt.evaluation.evaluator.PointOptions": {"cap": None},
+    "vg2gt.data.sources.Infinigen": {"max_depth": 30.0, "cameras": (0,)},
+    "vg2gt.data.views.drawn.ViewSelection": {"index": None, "targets": 4, "seed": 0},
+    "vg2gt.evaluation.evaluator.EvaluationOptions": {"depth_range": (None, None), "neighbors": 8},
+    "vg2gt.evaluation.evaluator.PointOptions": {"threshold": 0.05, "downsample": 0.02, "cap": None},
     "vg2gt.training.memory.ReturnFreeMemory": {"growth_mb": 600},
-    "backends.oracle.OracleBackend": {"patch_size": 14, "dim": 64, "response": 0.02},
-    "backends.da3.DA3Backend": {
-        "ffn": "mlp", "camera_depth": 4, "camera_heads": 16, "image_size": 518, "patch_size": 14, "revision": None,
-        "prefix": "model.", "seed": 0,
+    "vg2gt.training.module.VG2GTModule": {"rasterized_depth": False, "max_skipped": 20},
+    "vg2gt.training.checkpointing.BestCheckpoint": {"mode": "max"},
+    "vg2gt.training.muon.MuonAdamW": {"momentum": 0.8, "adamw": ("coarse",)},
+    "backends.oracle.OracleBackend": {
+        "patch_size": 14, "dim": 64, "taps": 4, "pose_noise": None, "response": 0.02, "seed": 0,
     },
-    "backends.da3.DA3MetricBackend": {
-        "image_size": 518, "patch_size": 14, "revision": None, "prefix": "model.", "seed": 0,
-    },
-    "backends.vggt.VGGTBackend": {
-        "dim": 1024, "depth": 24, "encoder_depth": 24, "num_heads": 16, "features": 256,
-        "out_channels": (256, 512, 1024, 1024), "camera_depth": 4, "camera_heads": 16, "image_size": 518,
-        "patch_size": 14, "repo": "facebook/VGGT-1B", "revision": None, "seed": 0,
+    "backends.sweep.SweepBackend": {"sources": 3, "seed": 0},
+    "backends.da3.DA3Backend": {"reference_view": "first", "revision": None, "seed": 0},
+    "backends.da3.DA3MetricBackend": {"revision": None, "seed": 0},
+    "backends.vggt.VGGTBackend": {"revision": None, "seed": 0},
+    "backends.published.Network": {
+        "licence": "unknown", "repo": None, "encoder_depth": 24, "ffn": "mlp", "multiview_from": None,
+        "camera_depth": 4, "camera_heads": 16, "image_size": 518, "patch_size": 14, "prefix": "model.",
     },
 }  # fmt: skip
 
@@ -304,6 +310,32 @@ def test_experiments_train_on_any_machine(tmp_path, machine, monkeypatch):
     assert config.optimizer.fused
     if isinstance(trainer.strategy, DDPStrategy):
         assert trainer.strategy._ddp_kwargs == {"broadcast_buffers": False}
+
+
+def written_keys(node: Any, place: str) -> Iterator[str]:
+    """Dotted keys that a configuration file writes, without Hydra's and those of instantiation (``_target_``)."""
+    if isinstance(node, dict) and node:
+        for key, value in node.items():
+            if key != "defaults":
+                yield from written_keys(value, f"{place}.{key}".strip("."))
+    elif place and not place.startswith("hydra.") and not place.rpartition(".")[2].startswith("_"):
+        yield place
+
+
+def test_there_are_few_files_and_keys() -> None:
+    """What nobody should turn is a default of a constructor, see :data:`DEFAULTS`."""
+    files = sorted(Path(config_dir()).rglob("*.yaml"))
+    keys: set[str] = set()
+    for group, options in variants().items():
+        for node in options.values():
+            keys.update(written_keys(node, "" if group == "ablation" else group))
+    for path in files:
+        if path.name != "variants.yaml":
+            of_all = path.read_text().startswith("# @package _global_")
+            group = "" if of_all else path.relative_to(config_dir()).parts[0].removesuffix(path.name)
+            keys.update(written_keys(OmegaConf.to_container(OmegaConf.load(path)), group))
+    assert len(files) <= 60
+    assert len(keys) <= 220, sorted(keys)
 
 
 def test_no_preset_but_a_trainers_chooses_the_machine() -> None:

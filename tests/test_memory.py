@@ -80,7 +80,7 @@ def test_below_the_limit_nothing_changes(caplog: pytest.LogCaptureFixture) -> No
 
 def test_training_logs_what_was_dropped(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     overrides = ["model.fine.max_voxels=200", "model.gaussians.max_gaussians=300", "trainer.max_steps=1"]
-    config = compose_run([*SMALL, *overrides, "trainer.log_every_n_steps=1", f"name={tmp_path.name}"], tmp_path)
+    config = compose_run([*SMALL, *overrides, "++trainer.log_every_n_steps=1", f"name={tmp_path.name}"], tmp_path)
     with caplog.at_level(logging.WARNING):
         train(config)
     (metrics,) = tmp_path.rglob("metrics.csv")

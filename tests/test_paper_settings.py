@@ -17,7 +17,7 @@ PAPER = ROOT.parent / "shared" / "paper" / "vg2gt.tex"
 TABLE = ROOT / "docs" / "concepts" / "deviations.md"
 # key: its value, and the line and words of the paper that give it
 STATED: dict[str, tuple[Any, int, str]] = {
-    "backend.repo": ("depth-anything/DA3-GIANT-1.1", 655, "DA3-GIANT-1.1 (1.15B)"),
+    "backend.name": ("da3_giant", 655, "DA3-GIANT-1.1 (1.15B)"),
     "model.scale.source": ("focal", 655, r"d_{\text{metric}} = \frac{f \cdot d_{\text{net}}}{300}"),
     "model.coarse.neighbors": (16, 200, "16 nearest voxel centers"),
     "model.fine.voxel_size": (0.002, 295, "voxel size to $0.002$ meters"),
@@ -49,7 +49,6 @@ STATED: dict[str, tuple[Any, int, str]] = {
     "backend.freeze": (True, 267, "the DA3 backbone and all original decoders are kept frozen"),
     "training.part": ("all", 267, "train only the proposed differentiable multi-scale voxel module"),
     "training.render_views": (None, 284, "rendered RGB images"),
-    "training.rasterized_depth": (False, 218, "we replace standard 3DGS rasterization"),
     "images": (420_000 * 2 * 18, 295, "420K iterations"),
     "trainer.devices": (2, 295, "two NVIDIA RTX PRO 6000 GPUs"),
     "trainer.max_steps": (420000, 295, "420K iterations"),

@@ -7,7 +7,7 @@ import lightning
 import torch
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from vg2gt.config import compose, compose_groups, config_dir, plugin_targets
+from vg2gt.config import compose, compose_groups, config_dir, plugin_targets, variants
 from vg2gt.model import VG2GT, Reconstructor
 from vg2gt.runs.checkpoints import MADE_OF
 from vg2gt.runs.load import made_of
@@ -22,7 +22,7 @@ SMALL = [
     "data.max_images=4",
     "trainer.accelerator=cpu",
     "trainer.enable_progress_bar=false",
-    "trainer.log_every_n_steps=1",
+    "++trainer.log_every_n_steps=1",
     "trainer.max_steps=4",
     "callbacks.progress_bar=null",
     "callbacks.checkpoint.every_n_train_steps=2",
@@ -36,13 +36,14 @@ NARROW = [
     "model.coarse.ptv3.dec_channels=[32,32,32,32]",
     "model.coarse.ptv3.enc_heads=[2,2,2,2,2]",
     "model.coarse.ptv3.dec_heads=[2,2,2,2]",
-    "model.fine.dense_head.features=16",
+    "++model.fine.dense_head.features=16",
 ]
 
 
 def group_options(group: str) -> list[str]:
     """The options that ``group=`` accepts, sorted."""
-    return sorted({*plugin_targets().get(group, {}), *(path.stem for path in Path(config_dir(), group).glob("*.yaml"))})
+    files = (path.stem for path in Path(config_dir(), group).glob("*.yaml"))
+    return sorted({*plugin_targets().get(group, {}), *variants().get(group, {}), *files})
 
 
 def small_config(folder: Path, cache: Path, *overrides: str) -> DictConfig:

@@ -129,7 +129,7 @@ def load(
         name: a run's folder or checkpoint, one of :func:`vg2gt.list_models`, a folder written by
             :func:`vg2gt.save_pretrained`, or ``OWNER/NAME`` on the Hugging Face Hub. None: the weights that ship with
             the package; with another backend than ``sweep``, an untrained head, which predicts coloured voxels.
-        backend: a name in ``configs/backend``; None: the backend that the model was trained with.
+        backend: an option of ``backend=``; None: the backend that the model was trained with.
         overrides: changes of the model's configuration as on the command line, such as
             ``["model.fine.max_voxels=500000"]``.
         revision: revision of a model on the Hub.

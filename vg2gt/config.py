@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import hydra
+import yaml
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
@@ -62,20 +63,6 @@ def plugin_targets() -> dict[str, dict[str, str]]:
     }
 
 
-def _register_plugins() -> None:
-    """Registers plug-ins as options; a file of the same name in ``configs/`` takes precedence."""
-    store = ConfigStore.instance()
-    for name, target in plugin_targets()["backend"].items():
-        store.store(name, {"_target_": target}, group="backend")
-    for name, target in plugin_targets()["data"].items():
-        ends = {end: {"_target_": target} for end in ("train", "val")}
-        node = {"defaults": [{"shared@_here_": "files"}, "_self_"], **ends, "image_size": [224, 336]}
-        store.store(name, node, group="data")
-
-
-_register_plugins()
-
-
 def config_dir() -> str:
     """Returns the absolute path of the configuration folder: in the installed package, or next to it in a checkout."""
     for folder in (_PACKAGE / "configs", _PACKAGE.parent / "configs"):
@@ -84,6 +71,28 @@ def config_dir() -> str:
     raise FileNotFoundError(
         f"configuration folder (with train.yaml) not found in or next to {_PACKAGE}; reinstall vg2gt"
     )
+
+
+def variants() -> dict[str, dict[str, Any]]:
+    """Returns the options in ``configs/variants.yaml`` by group and name."""
+    return yaml.safe_load(Path(config_dir(), "variants.yaml").read_text(encoding="utf-8"))
+
+
+def _register_options() -> None:
+    """Registers variants and plug-ins as options; a file of the same name in ``configs/`` takes precedence."""
+    store = ConfigStore.instance()
+    for group, options in variants().items():
+        for name, node in options.items():
+            store.store(name, node, group=group, package="_global_" if group == "ablation" else None)
+    for name, target in plugin_targets()["backend"].items():
+        store.store(name, {"_target_": target}, group="backend")
+    for name, target in plugin_targets()["data"].items():
+        ends = {end: {"_target_": target} for end in ("train", "val")}
+        node = {"defaults": [{"shared@_here_": "files"}, "_self_"], **ends, "image_size": [224, 336]}
+        store.store(name, node, group="data")
+
+
+_register_options()
 
 
 def compose(name: str | None, *overrides: str) -> DictConfig:

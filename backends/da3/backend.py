@@ -11,7 +11,8 @@ from torch import Tensor, nn
 from backends.da3.backbone import Backbone, ReferenceView
 from backends.dpt import DPT, decode_geometry
 from backends.network import NetworkBackend, decode_pose, encode_pose, normalize_images, predict
-from backends.vit import FeedForward, ViTBlock, ViTMLP
+from backends.published import network_named
+from backends.vit import ViTBlock, ViTMLP
 from backends.weights import Weights
 from vg2gt.geometry.cameras import invert_rigid, relative_to_first
 from vg2gt.geometry.precision import full_precision, half_precision_on_gpu
@@ -109,11 +110,6 @@ class DA3Backend(NetworkBackend):
     """Depth Anything 3 (Lin et al., 2025): relative geometry in the frame of a reference view.
 
     Args (for the others see :class:`NetworkBackend`; tokens have 2C channels):
-        depth: number of blocks.
-        multiview_from: first multi-view block.
-        ffn: feed-forward layer.
-        camera_depth: number of blocks of the camera encoder.
-        camera_heads: attention heads of the camera encoder.
         reference_view: strategy to choose the view that defines the predicted world frame.
         given_poses: whether to pass ``hints.cameras`` to the camera encoder, which makes them required.
 
@@ -127,40 +123,29 @@ class DA3Backend(NetworkBackend):
     def __init__(
         self,
         name: str,
-        licence: str,
-        dim: int,
-        depth: int,
-        num_heads: int,
-        multiview_from: int,
-        taps: Sequence[int],
-        features: int,
-        out_channels: Sequence[int],
-        ffn: FeedForward = "mlp",
-        camera_depth: int = 4,
-        camera_heads: int = 16,
-        image_size: int = 518,
-        patch_size: int = 14,
         reference_view: ReferenceView = "first",
         given_poses: bool = False,
         pretrained: bool = True,
-        repo: str | None = None,
         revision: str | None = None,
         path: str | None = None,
-        prefix: str = "model.",
         seed: int = 0,
         head_chunk: int | None = 8,
         freeze: bool = True,
+        **shape: Any,
     ) -> None:
         if reference_view not in get_args(ReferenceView):
             known = ", ".join(get_args(ReferenceView))
             raise ValueError(f"backend.reference_view is {reference_view!r}; choose one of {known}")
+        net = network_named(name, shape)
 
         def make() -> _DA3Network:
             network = _DA3Network(
-                Backbone(dim, depth, num_heads, ffn, multiview_from, image_size, patch_size),
-                _CameraEncoder(dim, camera_depth, camera_heads) if given_poses else None,
-                features,
-                out_channels,
+                Backbone(
+                    net.dim, net.depth, net.num_heads, net.ffn, net.multiview_from, net.image_size, net.patch_size
+                ),
+                _CameraEncoder(net.dim, net.camera_depth, net.camera_heads) if given_poses else None,
+                net.features,
+                net.out_channels,
             )
             decoder = network.cam_dec  # predicts about the identity pose and fields of view of 1 rad
             predict(decoder.fc_t, (0, 0, 0))
@@ -169,9 +154,11 @@ class DA3Backend(NetworkBackend):
             return network
 
         unused = (*RAY_BRANCH, "gs_head.", *(() if given_poses else ("cam_enc.",)))
-        ignorable = (*(prefix + part for part in unused), *(part for part in NESTED_PARTS if part != prefix))
-        weights = Weights(name, licence, pretrained, repo, revision, path, seed, prefix, ignorable)
-        super().__init__(make, weights, patch_size, 2 * dim, taps, head_chunk, freeze, needs_hints=given_poses)
+        ignorable = (*(net.prefix + part for part in unused), *(part for part in NESTED_PARTS if part != net.prefix))
+        weights = Weights(name, net.licence, pretrained, net.repo, revision, path, seed, net.prefix, ignorable)
+        super().__init__(
+            make, weights, net.patch_size, 2 * net.dim, net.taps, head_chunk, freeze, needs_hints=given_poses
+        )
         self.reference_view: ReferenceView = reference_view
 
     def encode_checked(self, images: Tensor, hints: Hints | None) -> Tokens:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -14,6 +14,7 @@ from backends.da3.backbone import Backbone
 from backends.da3.backend import NESTED_PARTS, DA3Backend
 from backends.dpt import DPT, in_chunks
 from backends.network import NetworkBackend, normalize_images
+from backends.published import network_named
 from backends.weights import Weights
 from vg2gt.geometry.precision import full_precision, half_precision_on_gpu
 from vg2gt.types import Cameras, Geometry, Hints, Tokens
@@ -33,7 +34,7 @@ class DA3MetricBackend(NetworkBackend):
 
     Depth is the network's output times the mean focal length (pixels at network resolution) / 300, in metres. It
     matches the cameras only if their translations are in metres. Sky pixels get the depth of the scene's far end. For
-    the arguments see :class:`NetworkBackend`; ``depth`` is the number of blocks.
+    the arguments see :class:`NetworkBackend`.
     """
 
     network: nn.ModuleDict
@@ -41,32 +42,25 @@ class DA3MetricBackend(NetworkBackend):
     def __init__(
         self,
         name: str,
-        licence: str,
-        dim: int,
-        depth: int,
-        num_heads: int,
-        taps: Sequence[int],
-        features: int,
-        out_channels: Sequence[int],
-        image_size: int = 518,
-        patch_size: int = 14,
         pretrained: bool = True,
-        repo: str | None = None,
         revision: str | None = None,
         path: str | None = None,
-        prefix: str = "model.",
         seed: int = 0,
         head_chunk: int | None = 8,
+        **shape: Any,
     ) -> None:
+        net = network_named(name, shape)
+
         def make() -> nn.ModuleDict:
-            backbone = Backbone(dim, depth, num_heads, "mlp", None, image_size, patch_size)
-            head = DPT(dim, features, out_channels, 1, patch_size, normalize=False, position_weight=0, sky=True)
+            backbone = Backbone(net.dim, net.depth, net.num_heads, "mlp", None, net.image_size, net.patch_size)
+            options = {"normalize": False, "position_weight": 0, "sky": True}
+            head = DPT(net.dim, net.features, net.out_channels, 1, net.patch_size, **options)
             return nn.ModuleDict({"backbone": nn.ModuleDict({"pretrained": backbone}), "head": head})
 
-        ignorable = tuple(part for part in NESTED_PARTS if part != prefix)
-        weights = Weights(name, licence, pretrained, repo, revision, path, seed, prefix, ignorable)
+        ignorable = tuple(part for part in NESTED_PARTS if part != net.prefix)
+        weights = Weights(name, net.licence, pretrained, net.repo, revision, path, seed, net.prefix, ignorable)
         properties = {"is_metric": True, "needs_hints": True, "predicts_cameras": False}
-        super().__init__(make, weights, patch_size, dim, taps, head_chunk, **properties)
+        super().__init__(make, weights, net.patch_size, net.dim, net.taps, head_chunk, **properties)
 
     def encode_checked(self, images: Tensor, hints: Hints | None) -> Tokens:
         """See :meth:`NetworkBackend.encode_checked`; token changes do not affect the scale factors of here."""

@@ -42,7 +42,7 @@ def backend(request: pytest.FixtureRequest):
 
 
 def load_config(name: str, *overrides: str) -> DictConfig:
-    """One file of configs/backend with overrides such as ``pretrained=false``."""
+    """One option of the group backend with overrides such as ``pretrained=false``."""
     return compose(None, f"+backend={name}", *(f"++backend.{override}" for override in overrides)).backend
 
 

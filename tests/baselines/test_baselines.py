@@ -197,7 +197,7 @@ def test_rotations_near_a_half_turn_do_not_cancel() -> None:
 
 def test_point_cloud_as_3dgs_starts(make, batch: Batch) -> None:
     """Spacing to the three nearest points, against all distances."""
-    model = make("pointcloud", "model.spacing=neighbors", "model.width=1", "model.opacity=0.1")
+    model = make("pointcloud", "+model.spacing=neighbors", "+model.width=1", "+model.opacity=0.1")
     gaussians = predict(model, batch).gaussians
     some = torch.arange(0, len(gaussians), 997)
     distances = torch.cdist(gaussians.means[some].double(), gaussians.means.double()).sort(1).values[:, 1:4]

@@ -19,7 +19,7 @@ from vg2gt.training.loop import train
 
 def overrides(cache: Path, *more: str) -> list[str]:
     small = ["data.image_size=[28,56]", "data.eval_scenes=6", "data.num_frames=4", "views=[2,3]", "device=cpu"]
-    return [*small, f"data.cache_dir={cache}", "data.val.first_seed=2000000", "pixels=1000000", *more]
+    return [*small, f"data.cache_dir={cache}", "data.val.first_seed=2000000", *more]
 
 
 @pytest.fixture(scope="module")

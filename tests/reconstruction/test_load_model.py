@@ -27,7 +27,7 @@ def test_a_run_is_rebuilt_with_its_weights(run_folder: Path, ready) -> None:
 
 
 def test_options_change_parts(run_folder: Path) -> None:
-    overrides = ["backend.depth_noise=0.5", "backend.taps=4", "model.fine.max_voxels=50", "renderer.near=0.5"]
+    overrides = ["backend.depth_noise=0.5", "+backend.taps=4", "model.fine.max_voxels=50", "renderer.near=0.5"]
     for backend in ("oracle", None):  # named again, or the run's own
         loaded = load_model(run_folder, backend, overrides, device="cpu")
         fine = loaded.model.get_submodule("fine")
@@ -108,7 +108,7 @@ def test_the_same_weights_with_other_tokens_are_refused(option: str, said: str, 
     assert load_model(tmp_path / "step-1.ckpt", "da3_tiny", ["backend.head_chunk=2"], device="cpu").weights.step == 1
     for backend in ("da3_tiny", None):  # named again, or the run's own
         with pytest.raises(ValueError, match=said):
-            load_model(tmp_path / "step-1.ckpt", backend, [f"backend.{option}"], device="cpu")
+            load_model(tmp_path / "step-1.ckpt", backend, [f"+backend.{option}"], device="cpu")
     with pytest.raises(ValueError, match=said):  # as the evaluation does
         resolve_parts(OmegaConf.from_dotlist([f"backend.{option}"]), tmp_path / "step-1.ckpt")
 

@@ -93,7 +93,7 @@ def spoil(module: nn.Module) -> None:
 @pytest.mark.parametrize("overrides", [(), ("model=voxel_merged",)], ids=" ".join)
 def test_far_points_of_two_scenes_can_be_numbered(overrides: tuple[str, ...], tmp_path: Path, cache: Path) -> None:
     small_voxels = ["fine", "coarse"] if not overrides else []
-    guards = [f"model.{part}.min_footprint=0" for part in small_voxels] or ["model.min_footprint=0"]
+    guards = [f"model.{part}.min_footprint=0" for part in small_voxels] or ["+model.min_footprint=0"]
     run = tiny_run(tmp_path, cache, *overrides, *guards)
     (good,) = first_batches(run, 1)
     far = SCENES["outliers on both sides"](good)

@@ -25,7 +25,7 @@ def _settings() -> Iterator[None]:
 def trained_weights(folder: Path, cache: Path, *overrides: str, threads: int = 1, steps: int = 3) -> Tensor:
     torch.set_num_threads(threads)
     torch.rand(threads)  # the state of the global generator before a run must not matter
-    options = [DROP, "trainer.deterministic=true", f"trainer.max_steps={steps}", "data.train_scenes=4"]
+    options = [DROP, "+trainer.deterministic=true", f"trainer.max_steps={steps}", "data.train_scenes=4"]
     run = tiny_run(folder, cache, *options, *overrides)
     before = weights(run).clone()
     run.trainer.fit(run.module, datamodule=run.datamodule)

@@ -130,7 +130,7 @@ def test_a_bad_gradient_of_one_parameter_skips_the_step(run: Run, caplog: pytest
 
 
 def test_too_many_in_a_row_stop_the_run_with_their_causes(tmp_path: Path, cache: Path) -> None:
-    run = tiny_run(tmp_path, cache, "training.max_skipped=3")
+    run = tiny_run(tmp_path, cache, "++training.max_skipped=3")
     (good,) = first_batches(run, 1)
     bad = [named(spoiled(good, "depth", float("nan")), f"room-{i}") for i in range(5)]
     expected = r"3 steps in a row .* rank 0, room-4: images, depth or cameras of the batch\. .*training\.max_skipped"
@@ -138,7 +138,7 @@ def test_too_many_in_a_row_stop_the_run_with_their_causes(tmp_path: Path, cache:
         fit(run, [bad[0], bad[1], good, bad[2], bad[3], bad[4]])
     assert run.module.skipped.total == 5
     with pytest.raises(ValueError, match=r"training\.max_skipped must be at least 1"):
-        tiny_run(tmp_path, cache, "training.max_skipped=0")
+        tiny_run(tmp_path, cache, "++training.max_skipped=0")
 
 
 def test_a_dropped_step_counts_for_schedule_and_data(tmp_path: Path, cache: Path) -> None:

@@ -10,10 +10,10 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from vg2gt.config import config_dir
+from vg2gt.config import compose_groups, config_dir, variants
 from vg2gt.evaluation.checks import refuse_training_views
 from vg2gt.runs.checkpoints import MADE_OF
-from vg2gt.runs.load import load_model
+from vg2gt.runs.load import load_model, refuse_other_tokens
 from vg2gt.runs.untrusted import ENVIRONMENT, UntrustedError, check_targets
 from vg2gt.studies.study import _refuse_other_run
 from vg2gt.training.start import name_differences
@@ -81,6 +81,20 @@ def test_what_the_user_names_is_called(run_folder: Path) -> None:
     assert load_model(run_folder, "oracle", ["backend.depth_noise=0"], device="cpu").weights.step == 7
 
 
+def test_defaults_of_a_stored_backend_import_nothing_foreign(tmp_path: Path) -> None:
+    """Also of a part of it."""
+    (tmp_path / "some_evil_pkg.py").write_text("class Net: pass\n")
+    own = OmegaConf.create(OmegaConf.to_container(compose_groups("backend=da3_nested").backend))
+    stored = OmegaConf.merge(own, {"metric": {"_target_": "some_evil_pkg.Net"}})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(tmp_path)
+        refuse_other_tokens(own, {MADE_OF: OmegaConf.to_yaml({"backend": stored})}, tmp_path)
+    assert "some_evil_pkg" not in sys.modules
+    stored = OmegaConf.merge(own, {"relative": {"taps": [1, 2, 3, 4]}})
+    with pytest.raises(ValueError, match=r"backend\.relative\.taps=\[1, 2, 3, 4\], but this run uses \[19, 27"):
+        refuse_other_tokens(own, {MADE_OF: OmegaConf.to_yaml({"backend": stored})}, tmp_path)
+
+
 YAMLS = {
     "object": ("!!python/object/apply:os.system ['touch {canary}']", "is not a run's configuration"),
     "module": ("!!python/module:antigravity ''", "is not a run's configuration"),
@@ -141,3 +155,5 @@ def test_everything_of_the_projects_configurations_is_trusted() -> None:
         assert files
         for path in files:
             check_targets(OmegaConf.load(path), path)
+        for name, option in variants().get(group, {}).items():
+            check_targets(OmegaConf.create(option), name)

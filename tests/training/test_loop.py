@@ -101,8 +101,8 @@ def everything_in(folder: Path) -> dict[Path, bytes]:
 
 REFUSED: list[tuple[list[str], str | None]] = [
     (["trainer.fast_dev_run=true", "+model.gaussians.max_offset=3"], None),
-    (["trainer.fast_dev_run=true", "ckpt=last", "backend.seed=1"], "trained on backbone"),
-    (["ckpt=last", "backend.taps=1"], r"step-4\.ckpt was trained with backend\.taps=4, but this run uses 1"),
+    (["trainer.fast_dev_run=true", "ckpt=last", "+backend.seed=1"], "trained on backbone"),
+    (["ckpt=last", "+backend.taps=1"], r"step-4\.ckpt was trained with backend\.taps=4, but this run uses 1"),
     (["ckpt=last", "model.gaussians.splits=4"], r"first mismatch: model\.gaussians\.out"),
     (["ckpt=last", "optimizer=adamw"], r"optimizer\._target_=torch\.optim\.AdamW differs from vg2gt\.training\.muon"),
     (["ckpt=last", "optimizer.lr=0.001"], r"optimizer\.lr=0\.001 differs from 0\.004.*optimiser's state.*init_from="),
@@ -113,7 +113,7 @@ REFUSED: list[tuple[list[str], str | None]] = [
         for override, message in {
             "data.workers=-1": r"data\.workers=-1 must be at least 0",
             "data.eval_samples=0": r"data\.eval_samples=0 must be at least 1",
-            "trainer.limit_val_batches=40": r"limit_val_batches=40 counts per device.*use data\.eval_samples",
+            "+trainer.limit_val_batches=40": r"limit_val_batches=40 counts per device.*use data\.eval_samples",
             "data.eval_scenes=0": r"data\.eval_scenes=0 must be at least 1",
             "optimizer.lr=-1": r"optimizer: Invalid learning rate: -1",
             "optimizer.lr=0": r"optimizer\.lr=0.*a positive number",

@@ -32,7 +32,7 @@ def test_a_resumed_run_keeps_what_its_optimiser_holds(tmp_path: Path, cache: Pat
     checkpoint = tmp_path / "checkpoints" / "step-2.ckpt"
     for override, said in (
         ("optimizer.weight_decay=0.1", r"optimizer\.weight_decay=0\.1 differs from 0\.05"),
-        ("~optimizer.betas", r"optimizer\.betas=not set differs from \[0\.9, 0\.95\]"),
+        ("~optimizer.betas", r"optimizer\.betas=\[0\.9, 0\.999\] differs from \[0\.9, 0\.95\]"),
         ("backend.freeze=false", r"backend\.freeze=False differs from True.*Keep the old value.*init_from="),
         ("training.backend_lr_factor=1", r"training\.backend_lr_factor=1 differs from 0\.1"),
     ):
@@ -44,6 +44,16 @@ def test_a_resumed_run_keeps_what_its_optimiser_holds(tmp_path: Path, cache: Pat
             small_config(tmp_path, cache, *backbone, "+optimizer.fused=true", "training.final_lr=1e-4"), checkpoint
         )
     assert "optimizer.fused, training.final_lr" in caplog.text
+
+
+def test_a_run_of_a_version_that_wrote_more_keys_is_resumed(tmp_path: Path, cache: Path) -> None:
+    keys = ["+optimizer.momentum=0.8", "+optimizer.adamw=[coarse]", "+training.max_skipped=20"]
+    old = small_config(tmp_path / "old", cache, *keys)
+    OmegaConf.save(OmegaConf.create(OmegaConf.to_container(old, resolve=True)), tmp_path / "config.yaml")
+    checkpoint = tmp_path / "checkpoints" / "step-2.ckpt"
+    name_differences(small_config(tmp_path, cache), checkpoint)
+    with pytest.raises(ValueError, match=r"optimizer\.momentum=0\.9 differs from 0\.8"):
+        name_differences(small_config(tmp_path, cache, "+optimizer.momentum=0.9"), checkpoint)
 
 
 def test_scenes_of_every_start_stay_known(tmp_path: Path, cache: Path, model) -> None:

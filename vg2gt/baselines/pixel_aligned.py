@@ -160,7 +160,7 @@ class VoxelMerged(PixelAligned):
         dense_head: Callable[..., DenseHead],
         gaussians: Callable[..., nn.Module],
         voxel_size: float = 0.002,
-        min_footprint: float = 1.0,
+        min_footprint: float = 3.3,
         background: Background = "black",
         visibility: ViewCheck | None = None,
     ) -> None:

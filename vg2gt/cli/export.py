@@ -11,7 +11,7 @@ from vg2gt.cli.errors import errors_in_one_line
 from vg2gt.config import compose_groups
 
 DETAILS = """
-backend=NAME selects a network of configs/backend, VGGT or a relative DA3 network; backend.key=value sets its options.
+backend=NAME selects a network, VGGT or a relative DA3 network; backend.key=value sets its options.
 The numbers of scenes, views, rows and columns stay dynamic."""
 
 

@@ -39,6 +39,11 @@ QUALITY = (
     "size, high in five times as many steps"
 )
 
+EACH = (
+    "images are captures (folders, videos, or a .txt file that lists them), each for a scene in DIR/NAME; what is done "
+    "is kept. hydra/launcher=NAME runs them elsewhere"
+)
+
 REFINE = "refine for N steps at the working size only, recordings too; 0: feed-forward"
 
 if TYPE_CHECKING:
@@ -53,6 +58,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     add = arguments.add_argument
     add("images", nargs="+", help="image files, a folder of them, a video, or a recording with known cameras")
     add("--out", metavar="DIR", required=True, help="where to write")
+    add("--each", action="store_true", help=EACH)
     add("--ckpt", metavar="PATH", help="a checkpoint or a run's folder; default: the shipped weights for "
         "backend=sweep, an untrained head for others")  # fmt: skip
     add("--poses", choices=("auto", "given", "sfm"), default="auto", help=POSES)
@@ -73,11 +79,16 @@ def main(argv: Sequence[str] | None = None) -> None:
     options = arguments.parse_args(given)
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     with errors_in_one_line():
-        run(options, overrides)
+        if options.each:
+            from vg2gt.cli.captures import reconstruct_each
+
+            reconstruct_each(options, overrides, run)
+        else:
+            run(options, overrides)
 
 
-def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
-    """Reconstructs a scene and writes the outputs."""
+def run(options: argparse.Namespace, overrides: Sequence[str]) -> Scene:
+    """Reconstructs a scene, writes the outputs and returns it."""
     from vg2gt.api import check_refinement, load
     from vg2gt.io.gaussian_files import READERS
     from vg2gt.memory import RECONSTRUCTION, memory_advice
@@ -134,6 +145,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     print(f"written: {', '.join(str(folder / name) for name in options.save)}")
     if any(f"scene{suffix}" in options.save for suffix in READERS):
         print(f"to look at it: vg2gt view {shlex.quote(str(folder))} --open")
+    return scene
 
 
 def _check(options: argparse.Namespace, overrides: Sequence[str]) -> None:

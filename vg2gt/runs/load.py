@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import inspect
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -15,6 +16,7 @@ from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from backends.published import NETWORKS
 from vg2gt.config import compose, compose_groups, flatten
 from vg2gt.io.tensors import tensors_digest
 from vg2gt.model import Reconstructor
@@ -91,7 +93,7 @@ def load_model(
         ckpt: a checkpoint or a run's folder. None loads the weights that ship with the package (:data:`SHIPPED`), or
             with another backend than ``sweep``, or ``backend=sweep`` with options that change what it computes, the
             untrained head of ``model=tiny_ungated`` (``oracle``: ``tiny``), which predicts coloured voxels.
-        backend: a name in ``configs/backend``, short for the override ``backend=NAME``; None keeps the run's backend.
+        backend: an option of ``backend=``, short for the override ``backend=NAME``; None keeps the run's backend.
         overrides: command-line overrides. ``backend=NAME``, ``model=NAME`` and ``renderer=NAME`` replace a part of the
             run's configuration; ``backend.key=value`` and the like change one key.
         device: ``auto``, ``cpu``, ``cuda`` or ``cuda:N``.
@@ -193,15 +195,35 @@ def refuse_other_tokens(backend: Any, checkpoint: Mapping[str, Any], path: Path)
     if not isinstance(text, str):
         return
     stored = parse_run_config(text, f"{path}: {MADE_OF}").get("backend")
-    here, there = (flatten(OmegaConf.to_container(OmegaConf.create(part or {}))) for part in (backend, stored))
-    if here.get("_target_") != there.get("_target_"):
+    parts: list[Any] = [OmegaConf.to_container(OmegaConf.create(part or {})) for part in (backend, stored)]
+    own, other = ({k: v for k, v in flatten(part).items() if k.endswith("_target_")} for part in parts)
+    if own != other:  # compared before any of the checkpoint's classes is imported
         return  # another network, which the hash of the weights reveals, or the same network as an ONNX bundle
+    here, there = (flatten(_with_defaults(part)) for part in parts)
     for key in sorted(here.keys() & there.keys()):
         if key.rpartition(".")[2] in TOKENS and here[key] != there[key]:
             raise ValueError(
                 f"{path} was trained with backend.{key}={there[key]}, but this run uses {here[key]}: use the same "
                 "value, or start a new run from these weights with init_from="
             )
+
+
+def _with_defaults(backend: Any) -> Any:
+    """Options of a backend, with the defaults of its constructor and the shape of its network where it names none."""
+    if not isinstance(backend, dict):
+        return list(backend) if isinstance(backend, tuple) else backend
+    if "_target_" in backend:
+        defaults = constructor_defaults(backend["_target_"])
+        named = str(backend.get("name", defaults.get("name")))
+        backend = defaults | NETWORKS.get(named, {}) | backend
+    return {key: _with_defaults(value) for key, value in backend.items()}
+
+
+def constructor_defaults(target: str) -> dict[str, Any]:
+    """Returns the arguments of a class with a default, tuples as lists; imports the class."""
+    parameters = inspect.signature(get_class(target)).parameters.items()
+    known = {name: each.default for name, each in parameters if each.default is not each.empty}
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in known.items()}
 
 
 def earlier_configs(path: Path) -> list[Path]:

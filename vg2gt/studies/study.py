@@ -51,7 +51,7 @@ def run_once(overrides: Sequence[str], folder: Path, scored: bool = True) -> Met
         SystemExit: if the training was asked to stop (SIGTERM); the same call resumes it.
     """
     config = compose_run(overrides, folder)
-    config.training.rasterized_depth = True  # studies report it
+    OmegaConf.update(config, "training.rasterized_depth", True, force_add=True)  # studies report it
     _refuse_other_run(config, folder)
     _refuse_other_start(config.init_from, folder)
     result = folder / "metrics.json"

@@ -63,6 +63,13 @@ class NewestCheckpoints(ModelCheckpoint):
                 path.unlink(missing_ok=True)
 
 
+class BestCheckpoint(ModelCheckpoint):
+    """Keeps the best state of the evaluations during training as ``best.ckpt``; for the arguments see Lightning."""
+
+    def __init__(self, dirpath: str, monitor: str, mode: str = "max") -> None:
+        super().__init__(dirpath, "best", monitor=monitor, mode=mode, enable_version_counter=False)
+
+
 class StopOnSignal(lightning.Callback):
     """On SIGTERM, Ctrl-C or SIGUSR1 (SLURM's notice), finishes the step, saves a checkpoint and ends normally.
 

@@ -89,7 +89,7 @@ class SkippedSteps:
         if self.in_a_row >= self.limit:
             raise FloatingPointError(
                 f"{self.in_a_row} steps in a row had a non-finite loss or gradient, the last: {'; '.join(faults)}. "
-                "Check its scenes, lower optimizer.lr, or raise training.max_skipped"
+                "Check its scenes, lower optimizer.lr, or raise +training.max_skipped"
             )
 
     def state_dict(self) -> dict[str, Any]:

@@ -58,6 +58,7 @@ TRAINER = {
     "check_val_every_n_epoch": None,  # val_check_interval counts steps
     "num_sanity_val_steps": 0,
     "enable_model_summary": False,
+    "log_every_n_steps": 10,
     "use_distributed_sampler": False,  # our sampler gives each rank its own scenes
 }
 """Lightning's options that follow from how we train; ``+trainer.KEY=VALUE`` changes them."""

@@ -21,7 +21,7 @@ from vg2gt.runs.checkpoints import (
     refuse_not_finite,
     run_config_path,
 )
-from vg2gt.runs.load import RESUMED_IN_PLACE, earlier_configs, refuse_other_tokens
+from vg2gt.runs.load import RESUMED_IN_PLACE, constructor_defaults, earlier_configs, refuse_other_tokens
 from vg2gt.runs.untrusted import read_run_config
 from vg2gt.training.module import VG2GTModule
 
@@ -136,6 +136,9 @@ def name_differences(config: DictConfig, checkpoint: Path) -> None:
     if not path.is_file():
         return
     before, now = (flatten(OmegaConf.to_container(c, resolve=True)) for c in (read_run_config(path), config))
+    if (target := now.get("optimizer._target_")) and before.get("optimizer._target_") == target:
+        defaults = {f"optimizer.{name}": value for name, value in constructor_defaults(target).items()}
+        before, now = defaults | before, defaults | now  # a former version wrote more of them
     different = sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))
     for key in different:
         of_optimizer = "optimizer._target_" in before and key.startswith("optimizer.") and key != HARDWARE
