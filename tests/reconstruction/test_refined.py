@@ -22,9 +22,9 @@ from vg2gt.outputs.saved import read_scene, renderer_of
 from vg2gt.reconstruction.frame import SceneFrame
 from vg2gt.reconstruction.photographs import full_size, load_photographs, sparse_points
 from vg2gt.reconstruction.policy import refined_by_default, refinement_for
-from vg2gt.reconstruction.refined import _judged, refinement_lines
+from vg2gt.reconstruction.refined import _judged, refine_scene, refinement_lines
 from vg2gt.reconstruction.scene import Scene
-from vg2gt.refinement import Refined, RefinedScene, RefineOptions, RefineRates
+from vg2gt.refinement import FullSizeOptions, Refined, RefinedScene, RefineOptions, RefineRates
 from vg2gt.rendering import Renderer
 
 ORACLE = ["backend=oracle", "backend.depth_noise=0.02", "--quiet", "--device", "cpu"]
@@ -183,3 +183,13 @@ def test_points_of_structure_from_motion_are_in_the_scenes_frame(scene: Scene) -
     own = scene.images[0].flatten(1).T[numbers]
     assert (colors - own).abs().mean() < 0.1
     assert [len(each) for each in sparse_points(replace(scene, pictures=()))] == [0, 0]
+
+
+@pytest.mark.parametrize(("longest", "stages"), [(112, 1), (336, 2)])
+def test_only_larger_photographs_have_a_second_stage(photos: Path, scene: Scene, longest: int, stages: int) -> None:
+    """What is no larger than the working size shows nothing new."""
+    large = max(find_pictures(photos), key=lambda picture: max(picture.size))
+    pictures = (large,) * len(scene.names)
+    options = RefineOptions(steps=2, full=FullSizeOptions(size=longest, steps=1, crop=32))
+    found = refine_scene(replace(scene, pictures=pictures), options).refined
+    assert (found.sharpened is None) == (stages == 1)
