@@ -45,8 +45,14 @@ def test_files_that_are_not_read_are_named(tmp_path: Path, caplog, monkeypatch) 
     for name in ("b.dng", "c.EXR", "d.gif", "e.mp4", "more/f.nef", "notes.txt", ".g.dng"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(b"1")
+    put(tmp_path / "elsewhere" / "images" / "1.jpg")
+    (tmp_path / "linked").symlink_to(tmp_path / "elsewhere" / "images")
+    (tmp_path / "elsewhere" / "report.json").write_text("{}")  # so that it is not searched itself
+    for name in ("g.MTS", "h.3gp", "i.nrw"):
+        (tmp_path / name).write_bytes(b"1")
     assert len(find_pictures(tmp_path)) == 1
-    assert "not read: b.dng, c.EXR, d.gif, e.mp4, more/f.nef (save" in caplog.text
+    named = "b.dng, c.EXR, d.gif, e.mp4, g.MTS, h.3gp, i.nrw, linked/ (a link), more/f.nef"
+    assert f"not read: {named} (save" in caplog.text
     (tmp_path / "a.jpg").unlink()
     with pytest.raises(ValueError, match=r"no images in .*; not read: b\.dng, c\.EXR"):
         find_pictures(tmp_path)

@@ -162,6 +162,25 @@ def test_the_lens_of_visualsfm_undistorts_what_is_measured() -> None:
         np.testing.assert_allclose(found, measured * 900 + [600, 400], atol=0.05)
 
 
+@pytest.mark.parametrize("kind", ["components", "chunks"])
+def test_worlds_of_metashape_are_not_mixed(folder: Path, frames, kind: str, caplog) -> None:
+    """Components without a transform, and chunks, have worlds of their own, which were taken for one."""
+    path = metashape(folder, frames.world_to_camera.double().numpy(), 90.0, np.array([55.5, 41.5]))
+    content = path.read_text()
+    if kind == "components":
+        content = content.replace("</component></components>", '</component><component id="1"/></components>')
+        content = content.replace('id="3" sensor_id="0" component_id="0"', 'id="3" sensor_id="0" component_id="1"')
+    else:
+        first, second = content.index('<camera id="3"'), content.index("</group>")
+        moved = f"<cameras>{content[first:second]}</cameras></chunk></document>"
+        sensors = content[content.index("<sensors>") : content.index("<cameras>")]
+        content = (content[:first] + content[second:]).replace("</document>", f"<chunk>{sensors}{moved}")
+    path.write_text(content)
+    assert [Path(camera.name).stem for camera in read_photogrammetry(path)] == ["008", "009", "010"]
+    assert f"{path} has several chunks or components" in caplog.text
+    assert "ignored: 011" in caplog.text
+
+
 def test_names_are_matched_by_folders_names_and_stems() -> None:
     cameras = [
         ForeignCamera(name, np.eye(4), None, (1.0, 1.0)) for name in ("C:\\p\\front\\1.JPG", "back/1.jpg", "2", "3.tif")

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import unicodedata
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -55,6 +56,11 @@ def put_cameras(folder: Path, frames, names=NAMES, size=SIZE, intrinsics=None) -
     poses = frames.world_to_camera.double().numpy()
     cameras = [io.NamedCamera(name, size[1], size[0], k, pose) for name, pose in zip(names, poses, strict=False)]
     io.write_cameras_json(folder / "cameras.json", cameras)
+
+
+def put_nvm(folder: Path, frames) -> None:
+    rows = ["NVM_V3", "", str(len(NAMES)), *(f"images/{name}\t90 1 0 0 0 {i} 0 0 0 0" for i, name in enumerate(NAMES))]
+    (folder / "model.nvm").write_text("\n".join([*rows, "0", ""]))
 
 
 def check_cameras(pictures: list[Picture] | None, frames, kind: str) -> None:
@@ -208,6 +214,23 @@ def test_a_phones_export_is_read_at_the_size_of_its_photographs(needed: bool, tm
     loaded = pictures[1].read((30, 40))
     assert bool(loaded.depth.any()) == needed
     torch.testing.assert_close(loaded.world_to_camera[0], frames.world_to_camera[1], atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("put", [put_transforms, put_cameras, put_nvm])
+def test_umlauts_as_macos_writes_them(put, folder: Path, frames) -> None:
+    """Composed in the file of cameras, decomposed in names of files and of their folder."""
+    put(folder, frames)
+    for name in NAMES:
+        (folder / "images" / name).rename(folder / "images" / unicodedata.normalize("NFD", f"Küche {name}"))
+    file = next(each for each in folder.iterdir() if each.suffix in (".json", ".nvm"))
+    text = file.read_text()
+    for name in NAMES:
+        text = text.replace(name, f"Küche{chr(34) if file.suffix == '.nvm' else ' '}{name}")
+    file.write_text(text, encoding="utf-8")
+    pictures = given_pictures(folder) or []
+    assert [unicodedata.normalize("NFC", picture.name) for picture in pictures] == [
+        f"Küche {Path(name).stem}" for name in NAMES
+    ]
 
 
 @pytest.mark.parametrize("put", [put_transforms, put_cameras])

@@ -83,6 +83,8 @@ def test_a_reduced_photograph_fits_its_camera() -> None:
 def test_numbers_make_names_unique() -> None:
     pictures = [Picture(name, (8, 8), lambda size: None) for name in ("a", "a", "a-000")]  # type: ignore[arg-type]
     assert [each.name for each in with_unique_names(pictures)] == ["a-001", "a-002", "a-000"]
+    twins = [Picture(name, (8, 8), lambda size: None) for name in ("A", "a", "B", "A-000")]  # type: ignore[arg-type]
+    assert [each.name for each in with_unique_names(twins)] == ["A-001", "a-002", "B", "A-000"]
 
 
 def test_working_size() -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from PIL import features
 
+from vg2gt.data.sources.masks import image_of_mask
 from vg2gt.data.sources.parsing import IMAGE_FOLDERS, OTHER_FOLDERS, PHOTO_SUFFIXES, is_image_folder
 from vg2gt.io.errors import some
 from vg2gt.io.files import by_number
@@ -19,8 +20,11 @@ log = logging.getLogger(__name__)
 
 # Images that are not read as photographs, and those that cameras store in addition to or instead of them.
 _OTHER_SUFFIXES = (
-    *(".arw", ".cr2", ".cr3", ".dng", ".exr", ".gif", ".hdr", ".insp", ".jp2", ".j2k", ".jxl", ".nef", ".orf", ".pef"),
-    *(".psd", ".raf", ".raw", ".rw2", ".srw", ".svg", ".tga", ".insv", ".lrv", R3D, *VIDEO_SUFFIXES),
+    *(".exr", ".gif", ".hdr", ".hif", ".insp", ".j2k", ".jp2", ".jxl", ".jxr", ".psb", ".psd", ".svg", ".tga", ".xcf"),
+    *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".gpr", ".iiq", ".kdc", ".mef", ".mos", ".mrw"),
+    *(".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw", ".x3f"),
+    *(".360", ".3gp", ".flv", ".insv", ".lrv", ".m2ts", ".mpeg", ".mpg", ".mts", ".mxf", ".ogv", ".ts", ".wmv"),
+    *(R3D, *VIDEO_SUFFIXES),
 )
 _RESULTS = ("report.json", "sfm.json", "scene.ply")  # in folders that vg2gt has written
 
@@ -78,17 +82,21 @@ def _can_read(path: Path) -> bool:
 
 
 def _photos(folder: Path, without: list[Path]) -> list[Path]:
-    return [file for file in _walk(folder, without) if is_photo(file) and _can_read(file)]
+    found = [file for file in _walk(folder, without) if is_photo(file) and _can_read(file)]
+    return [file for file in found if image_of_mask(file) is None]
 
 
 def _others(folder: Path) -> str:
     """Describes images and videos that are not read; empty if there are none."""
+    known = image_folders(folder)
     files = [
         str(file.relative_to(folder))
-        for file in _walk(folder, image_folders(folder))
+        for file in _walk(folder, known)
         if not file.name.startswith(".")
         and (file.suffix.lower() in _OTHER_SUFFIXES or (is_photo(file) and not _can_read(file)))
     ]
+    links = [path for path in folder.iterdir() if path.is_symlink() and path.is_dir() and path not in known]
+    files += [f"{path.name}/ (a link)" for path in links if not OTHER_FOLDERS.fullmatch(path.name)]
     if not files:
         return ""
     named = some(sorted(files, key=by_number))

@@ -13,6 +13,7 @@ from vg2gt.inputs.damaged import read_each
 from vg2gt.io.cameras_json import NamedCamera, Photo
 from vg2gt.io.colmap import colmap_intrinsics, require_pycolmap
 from vg2gt.io.errors import FormatError
+from vg2gt.io.files import composed
 from vg2gt.io.image_files import image_size
 from vg2gt.io.photogrammetry import ForeignCamera, is_camera_file, read_photogrammetry
 
@@ -48,7 +49,7 @@ def _by_key(cameras: Sequence[ForeignCamera], parts: int, with_suffix: bool) -> 
 def _key(name: str, parts: int, with_suffix: bool) -> str:
     path = PurePosixPath(name.replace("\\", "/"))
     short = path.name if with_suffix else path.stem if path.suffix else path.name
-    return "/".join([*path.parts[:-1], short][-parts:]).lower()
+    return composed("/".join([*path.parts[:-1], short][-parts:]).lower())
 
 
 def named_camera(camera: ForeignCamera, name: str, size: tuple[int, int]) -> NamedCamera:

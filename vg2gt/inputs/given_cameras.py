@@ -37,7 +37,7 @@ from vg2gt.inputs.pictures import (
 )
 from vg2gt.io.cameras_json import NamedCamera, Photo, read_cameras_json
 from vg2gt.io.errors import FormatError, some
-from vg2gt.io.files import read_json
+from vg2gt.io.files import composed, read_json
 from vg2gt.io.image_files import is_damaged, read_color
 from vg2gt.io.nerfstudio import read_transforms
 from vg2gt.io.photogrammetry import is_camera_file
@@ -270,16 +270,19 @@ def _from_cameras_json(path: Path, folder: Path) -> list[Picture] | None:
         ValueError: if the file names none of the images.
     """
     named = read_cameras_json(path)
-    cameras = _unique([(Path(camera.name).name, camera) for camera in named])
-    cameras |= _unique([(camera.photo.name, camera) for camera in named if camera.photo is not None])
+    cameras = _unique([(composed(Path(camera.name).name), camera) for camera in named])
+    cameras |= _unique([(composed(camera.photo.name), camera) for camera in named if camera.photo is not None])
     by_stem = _unique([(Path(name).stem, camera) for name, camera in cameras.items()])
     files = image_files(folder)
-    found = [(file, cameras.get(file.name) or by_stem.get(file.stem) or by_stem.get(file.name)) for file in files]
+    names = [composed(file.name) for file in files]
+    stems = [by_stem.get(Path(name).stem) or by_stem.get(name) for name in names]
+    found = [(file, cameras.get(name) or stem) for file, name, stem in zip(files, names, stems, strict=True)]
     known = [(file, camera) for file, camera in found if camera is not None]
     if not known:
         raise DataError(f"{path} names none of the {len(files)} images in {folder}, such as {files[0].name}")
     if any(
-        camera.photo and camera.photo.lens == UNKNOWN_LENS and camera.photo.name == file.name for file, camera in known
+        camera.photo and camera.photo.lens == UNKNOWN_LENS and composed(camera.photo.name) == composed(file.name)
+        for file, camera in known
     ):
         log.warning("%s describes undistorted images and is ignored for the photos in %s", path, folder)
         return None
@@ -319,7 +322,7 @@ def _from_programs(place: Path, folder: Path, above: bool) -> list[Picture] | No
 def _photo(path: Path, camera: NamedCamera, cameras: Path, as_stored: bool = False) -> Picture:
     """Returns a photograph with its camera, that of the whole photograph if the file has it."""
     photo = camera.photo
-    if photo is None or photo.name != path.name:
+    if photo is None or composed(photo.name) != composed(path.name):
         photo = Photo(path.name, camera.width, camera.height, camera.intrinsics)
     undistortion = undistortion_of(photo.lens) if photo.lens else None
     expected = undistortion.lens_size if undistortion else (photo.height, photo.width)

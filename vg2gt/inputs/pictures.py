@@ -20,7 +20,14 @@ from torch import Tensor
 
 from vg2gt.data.base import Frames
 from vg2gt.data.sources.masks import FOLDER as MASKS
-from vg2gt.data.sources.masks import joined_masks, mask_beside, resized_mask, warn_without_mask
+from vg2gt.data.sources.masks import (
+    image_of_mask,
+    joined_masks,
+    mask_beside,
+    mask_folder,
+    resized_mask,
+    warn_without_mask,
+)
 from vg2gt.data.sources.parsing import HEIC_SUFFIXES, PHOTO_SUFFIXES
 from vg2gt.data.sources.sparse_points import ObservedPoints
 from vg2gt.data.transforms import from_bytes, to_bytes
@@ -105,15 +112,18 @@ def find_pictures(images: ImagesLike, max_images: int | None = None) -> list[Pic
         ValueError: if there is no picture (the message names where was searched), or none can be read.
     """
     faults: dict[str, str] = {}
-    chosen = [picture for item in as_items(images) for picture in _pictures(item, max_images, faults)]
+    items = [
+        item for item in as_items(images) if not isinstance(item, (str, Path)) or image_of_mask(Path(item)) is None
+    ]
+    chosen = [picture for item in items for picture in _pictures(item, max_images, faults)]
     name_left_out(faults, len(chosen) + len(faults))
     if not chosen:
         raise ValueError("there are no images to reconstruct; give image files, a folder of them, or a video")
     taken = evenly(chosen, max_images)
     photos = [picture.path for picture in taken if picture.path is not None]
     masks = {photo: mask_beside(photo) for photo in photos}
-    folders = {place / MASKS for photo in photos for place in (photo.parent, photo.parent.parent)}
-    known = sorted(str(folder) for folder in folders if folder.is_dir())
+    folders = {mask_folder(place) for photo in photos for place in (photo.parent, photo.parent.parent)}
+    known = sorted(str(folder) for folder in folders if folder is not None)
     if known or any(masks.values()):
         lacking = [str(photo) for photo, mask in masks.items() if mask is None]
         warn_without_mask(lacking, len(masks), (known or [MASKS])[0])
@@ -211,7 +221,7 @@ def mask_for(path: Path, upright: bool = True, content: bytes | None = None) -> 
     parts = [read_mask(path, "", content=content, upright=upright)]
     file = mask_beside(path)
     if content is None and file is not None:
-        parts.append(read_mask_file(file, "", path if upright else None))
+        parts.append(read_mask_file(file, "", path, upright))
     return joined_masks(parts)
 
 
@@ -343,14 +353,18 @@ def spread(count: int, limit: int) -> list[int]:
 
 
 def with_unique_names(pictures: Sequence[Picture]) -> list[Picture]:
-    """Returns the pictures with a number appended to names that occur more than once."""
-    counts = Counter(picture.name for picture in pictures)
+    """Returns the pictures with a number appended to names that occur more than once, in any case.
+
+    Files named after them must not replace each other on Windows and macOS, which ignore case.
+    """
+    counts = Counter(picture.name.lower() for picture in pictures)
     numbers = {name: itertools.count() for name, count in counts.items() if count > 1}
 
     def unused(name: str) -> str:
-        return next(new for number in numbers[name] if (new := f"{name}-{number:03d}") not in counts)
+        candidates = (f"{name}-{number:03d}" for number in numbers[name.lower()])
+        return next(candidate for candidate in candidates if candidate.lower() not in counts)
 
-    return [replace(each, name=unused(each.name)) if each.name in numbers else each for each in pictures]
+    return [replace(each, name=unused(each.name)) if each.name.lower() in numbers else each for each in pictures]
 
 
 def without_copies(pictures: Sequence[Picture]) -> list[Picture]:
