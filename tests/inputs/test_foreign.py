@@ -10,6 +10,7 @@ from tests.inputs.test_given_cameras import NAMES
 from tests.reconstruction.conftest import SIZE
 from vg2gt.cli import reconstruct as reconstruct_command
 from vg2gt.inputs.camera_files import read_cameras
+from vg2gt.inputs.cameras import pictures_for
 from vg2gt.inputs.foreign import matched
 from vg2gt.inputs.given_cameras import given_pictures
 from vg2gt.io.photogrammetry import ForeignCamera, read_photogrammetry
@@ -192,6 +193,25 @@ def test_names_are_matched_by_folders_names_and_stems() -> None:
     assert matched(cameras[:1], [Path("/x/a/1.jpg"), Path("/x/b/1.jpg")]) == {}  # either could be meant
 
 
+def test_files_of_cameras_in_the_folder_of_the_images(folder: Path, frames) -> None:
+    path = metashape(folder, frames.world_to_camera.double().numpy(), 90.0, np.array([55.5, 41.5]))
+    path.rename(folder / "images" / path.name)
+    assert [picture.source for picture in given_pictures(folder) or []] == [f"cameras.xml {folder / 'images'}"] * 4
+
+
+def test_files_that_may_have_cameras_are_named_if_they_are_not_read(folder: Path, model, monkeypatch, caplog) -> None:
+    """Exports of OpenMVG, Pix4D and others: structure from motion began without a word."""
+    names = ("a_calibrated_external_camera_parameters.txt", "export.csv", "notes.txt", "sfm_data.json")
+    for name in names:
+        (folder / name).write_text("Name,X,Y,Z")
+    monkeypatch.setattr("vg2gt.inputs.cameras.find_cameras", lambda pictures, *_: pictures)
+    for poses, said in (("sfm", False), ("auto", True)):
+        with pictures_for(model, folder, poses) as pictures:  # type: ignore[arg-type]
+            assert len(pictures) == 4
+        named = ", ".join(str(folder / name) for name in names if name != "notes.txt")
+        assert (f"not read as cameras: {named} (" in caplog.text) == said
+
+
 def test_files_that_do_not_fit_are_named(folder: Path, frames, tmp_path: Path) -> None:
     poses = frames.world_to_camera.double().numpy()
     path = metashape(folder, poses, 90.0, np.array([55.5, 41.5]))
@@ -200,6 +220,12 @@ def test_files_that_do_not_fit_are_named(folder: Path, frames, tmp_path: Path) -
         (whole[: len(whole) // 2], r"cameras\.xml: damaged file of cameras"),
         (whole.replace('type="frame"', 'type="spherical"'), "has the type spherical, which is not read"),
         (whole.replace("<f>90.0</f>", "<f>nan</f>"), "is not finite"),
+        (
+            whole.replace(f'width="{SIZE[1]}" height="{SIZE[0]}"', f'width="{SIZE[0]}" height="{SIZE[1]}"').replace(
+                "<f>", "<k1>0.01</k1><f>"
+            ),
+            r"008\.png is 112x84 pixels, but its camera is of 84x112",
+        ),
         (whole.replace("00", "77").replace("01", "77"), r"cameras\.xml names none of the 4 images"),
     ):
         path.write_text(text)

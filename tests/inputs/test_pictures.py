@@ -102,11 +102,15 @@ def test_working_size() -> None:
             working_size([(60, 50)], 14, "cpu", size)
 
 
-def test_files_that_cannot_be_used_are_refused(tmp_path: Path, monkeypatch) -> None:
-    (tmp_path / "IMG.HEIC").touch()
+@pytest.mark.parametrize("name", ["IMG.HEIC", "IMG.jpg"])
+def test_heic_names_its_package(tmp_path: Path, monkeypatch, name: str) -> None:
+    """Known by its content: a cloud's ``.jpg`` that is HEIC was "not an image"."""
+    Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(tmp_path / "other.png")
+    (tmp_path / name).write_bytes(b"\0\0\0\x18ftypheic\0\0\0\0mif1heic" + bytes(100))
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(ValueError, match="pip install pillow-heif"):
-        find_pictures(tmp_path / "IMG.HEIC")
+    for given in (tmp_path, tmp_path / name):
+        with pytest.raises(ImportError, match=f"{name} is HEIC: pip install pillow-heif, or save it as JPEG"):
+            find_pictures(given)
 
 
 def test_what_is_no_image() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import logging
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -11,13 +12,17 @@ from typing import Literal, get_args
 
 from vg2gt.data.base import DataError
 from vg2gt.data.sources.masks import AmbiguousMaskError
+from vg2gt.inputs.foreign import unread_camera_files
 from vg2gt.inputs.given_cameras import LAYOUTS, describe, given_pictures
-from vg2gt.inputs.pictures import ImagesLike, Picture, check_pictures, find_pictures, without_copies
+from vg2gt.inputs.pictures import ImagesLike, Picture, as_items, check_pictures, find_pictures, without_copies
 from vg2gt.inputs.sfm import find_cameras, require_pycolmap
 from vg2gt.inputs.usable import usable_pictures
+from vg2gt.io.errors import some
 from vg2gt.io.files import by_number
 from vg2gt.model import Reconstructor
 from vg2gt.monitor import Monitor
+
+log = logging.getLogger(__name__)
 
 Poses = Literal["auto", "given", "sfm"]
 
@@ -80,6 +85,8 @@ def pictures_for(
         raise ValueError(
             f"no cameras next to {describe(images)}: expected {LAYOUTS}; --poses sfm finds them from the images"
         )
+    if poses == "auto":
+        _name_unread(images)
     with tempfile.TemporaryDirectory(prefix="vg2gt-sfm-") as temporary:
         pictures = usable_pictures(without_copies(find_pictures(images, max_images)), monitor)
         place = {picture.name: number for number, picture in enumerate(pictures)}
@@ -121,6 +128,14 @@ def _given_pictures(images: ImagesLike, max_images: int | None, depth: bool, pos
             f"cannot use the camera files of {describe(images)}: {error}; --poses sfm ignores them and finds the "
             "cameras from the images"
         ) from error
+
+
+def _name_unread(images: ImagesLike) -> None:
+    """Warns about files next to the images that may have cameras but are not read."""
+    paths = [Path(item).expanduser() for item in as_items(images) if isinstance(item, (str, Path))]
+    folders = dict.fromkeys(path if path.is_dir() else path.parent for path in paths)
+    if files := [str(file) for folder in folders for file in unread_camera_files(folder)]:
+        log.warning("the cameras are found from the images; not read as cameras: %s (%s are)", some(files), LAYOUTS)
 
 
 def _no_depth(backend: str, images: ImagesLike) -> str:

@@ -304,7 +304,7 @@ def _of_camera_file(path: Path) -> list[Picture]:
 
 def _from_programs(place: Path, folder: Path, above: bool) -> list[Picture] | None:
     """Returns pictures of a folder with cameras of other programs; of several files, the one that names most counts."""
-    cameras = camera_files_in(place)
+    cameras = camera_files_in(place) + (camera_files_in(folder) if folder.resolve() != place.resolve() else [])
     if not cameras:
         return None
     files = image_files(folder)

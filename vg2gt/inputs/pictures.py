@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import importlib.util
 import itertools
 import logging
 from collections import Counter
@@ -28,7 +27,7 @@ from vg2gt.data.sources.masks import (
     resized_mask,
     warn_without_mask,
 )
-from vg2gt.data.sources.parsing import HEIC_SUFFIXES, PHOTO_SUFFIXES
+from vg2gt.data.sources.parsing import PHOTO_SUFFIXES
 from vg2gt.data.sources.sparse_points import ObservedPoints
 from vg2gt.data.transforms import from_bytes, to_bytes
 from vg2gt.inputs.damaged import name_left_out, readable
@@ -146,9 +145,7 @@ def check_pictures(paths: Sequence[str]) -> None:
     for path in found:
         if path.suffix.lower() in VIDEO_SUFFIXES:
             require_pyav(f"reading {path}")
-        elif path.is_file():
-            _allow_heic(path)
-        elif not any(file.suffix.lower() in _HOLDS_PICTURES for file in path.rglob("*")):
+        elif path.is_dir() and not any(file.suffix.lower() in _HOLDS_PICTURES for file in path.rglob("*")):
             image_files(path)
 
 
@@ -258,17 +255,6 @@ def _photos(files: Sequence[Path], faults: dict[str, str]) -> list[Picture]:
     ]
 
 
-def _allow_heic(path: Path) -> None:
-    """Makes Pillow read HEIC if the file is one."""
-    if path.suffix.lower() not in HEIC_SUFFIXES:
-        return
-    if importlib.util.find_spec("pillow_heif") is None:
-        raise ValueError(f"{path} is HEIC and requires pillow-heif: pip install pillow-heif, or save it as JPEG")
-    from pillow_heif import register_heif_opener  # pyright: ignore[reportMissingImports]
-
-    register_heif_opener()
-
-
 def _faces(photo: Picture, path: Path, panorama: Panorama) -> list[Picture]:
     """Returns the faces of a panorama; they have no file of their own."""
 
@@ -285,7 +271,6 @@ def _faces(photo: Picture, path: Path, panorama: Panorama) -> list[Picture]:
 
 def _photo(path: Path, content_of: Callable[[Path], bytes | None] = lambda _: None) -> Picture:
     """Returns a photograph; ``content_of`` reads files inside an archive."""
-    _allow_heic(path)
 
     def read(size: tuple[int, int]) -> Frames:
         content = content_of(path)

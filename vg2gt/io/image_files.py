@@ -233,9 +233,9 @@ def read_mask_file(path: Path, scene: str, photo: Path, upright: bool = False) -
         return None
     with _opened(photo, scene) as image:
         turn, stored, turned = _orientation(image), _size(image, False), _size(image, upright)
-    if _same_shape(mask.shape, turned):
+    if same_shape(mask.shape, turned):
         return mask
-    if _same_shape(mask.shape, stored):
+    if same_shape(mask.shape, stored):
         return np.array(_turned(Image.fromarray(mask), turn))
     raise DataError(
         f"the mask {path} is {mask.shape[1]}x{mask.shape[0]} pixels, but its image {photo} is {turned[1]}x{turned[0]}: "
@@ -243,9 +243,9 @@ def read_mask_file(path: Path, scene: str, photo: Path, upright: bool = False) -
     )
 
 
-def _same_shape(small: tuple[int, ...], size: Size) -> bool:
-    """Returns whether an image of a size ``small`` can be one of ``size`` resized, rounded to whole pixels."""
-    return abs(small[0] * size[1] / (small[1] * size[0]) - 1) < max(_SAME_SHAPE, 2 / min(small))
+def same_shape(one: tuple[int, ...], other: tuple[int, ...]) -> bool:
+    """Returns whether an image of one ``(height, width)`` can be one of the other resized, rounded to whole pixels."""
+    return abs(one[0] * other[1] / (one[1] * other[0]) - 1) < max(_SAME_SHAPE, 2 / min(*one, *other))
 
 
 def orientation(path: Path, scene: str) -> int:

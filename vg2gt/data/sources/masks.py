@@ -74,13 +74,23 @@ def _candidates(image: Path, marks: Sequence[str]) -> Iterator[Path]:
 
 def image_of_mask(path: Path) -> Path | None:
     """Returns the image that a file next to it is the mask of, by its name ``NAME_mask.png``; None if there is none."""
-    for mark in _MARKS:
-        if path.stem.lower().endswith(mark):
-            image = path.with_name(path.stem[: -len(mark)])
-            if image.suffix.lower() in PHOTO_SUFFIXES and image.is_file():
-                return image
-            return _same_stem(image.with_name(f"{image.name}.x"))
-    return None
+    return image_beside(path, _MARKS)
+
+
+def image_beside(path: Path, marks: Sequence[str]) -> Path | None:
+    """Returns the image ``NAME.*`` that a file ``NAME_mask.png`` belongs to; None if there is none.
+
+    Args:
+        path: the file.
+        marks: what can be between the image's name and the suffix, in lower case.
+    """
+    mark = next((each for each in marks if path.stem.lower().endswith(each)), None)
+    if mark is None:
+        return None
+    image = path.with_name(path.stem[: -len(mark)])
+    if image.suffix.lower() in PHOTO_SUFFIXES and image.is_file():
+        return image
+    return _same_stem(image.with_name(f"{image.name}.x"))
 
 
 @lru_cache(maxsize=256)

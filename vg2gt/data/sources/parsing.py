@@ -24,8 +24,7 @@ from vg2gt.io.errors import FormatError
 from vg2gt.io.files import by_number, regular
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".tif", ".tiff", ".webp", ".bmp")
-HEIC_SUFFIXES = (".heic", ".heif")
-PHOTO_SUFFIXES = (*IMAGE_SUFFIXES, *HEIC_SUFFIXES, ".avif", ".jfif", ".jpe")
+PHOTO_SUFFIXES = (*IMAGE_SUFFIXES, ".heic", ".heif", ".avif", ".jfif", ".jpe")
 IMAGE_FOLDERS = ("images", "color", "rgb", "image", "input")
 OTHER_FOLDERS = re.compile(
     r"[._@].*|masks?|depths?|depth[_-].*|.*[_-]depths?|normals?|conf(idence)?|sparse|dense|stereo|semantics?|labels?|"
