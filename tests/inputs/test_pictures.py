@@ -102,6 +102,15 @@ def test_working_size() -> None:
             working_size([(60, 50)], 14, "cpu", size)
 
 
+@pytest.mark.parametrize("suffix", ["webp", "png"])
+def test_files_of_several_pictures_are_named(tmp_path: Path, suffix: str, caplog) -> None:
+    pages = [Image.fromarray(np.full((8, 8, 3), 90 * i, np.uint8)) for i in range(3)]
+    pages[0].save(tmp_path / f"a.{suffix}", save_all=True, append_images=pages[1:])
+    pages[0].save(tmp_path / "b.png")
+    assert len(find_pictures(tmp_path)) == 2
+    assert f"1 files hold several pictures, of which the first is used: a.{suffix}" in caplog.text
+
+
 @pytest.mark.parametrize("name", ["IMG.HEIC", "IMG.jpg"])
 def test_heic_names_its_package(tmp_path: Path, monkeypatch, name: str) -> None:
     """Known by its content: a cloud's ``.jpg`` that is HEIC was "not an image"."""

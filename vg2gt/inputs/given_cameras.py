@@ -20,6 +20,7 @@ from vg2gt.data.sources.phone import app_of
 from vg2gt.data.sources.rgbd import RGBDFolder
 from vg2gt.data.sources.undistortion import size_on_disk, undistortion_of
 from vg2gt.geometry.cameras import resize_intrinsics
+from vg2gt.inputs.camera_files import cameras_of_json
 from vg2gt.inputs.damaged import read_each
 from vg2gt.inputs.folders import image_files, image_folders, is_photo
 from vg2gt.inputs.foreign import camera_files_in, foreign_cameras
@@ -35,7 +36,7 @@ from vg2gt.inputs.pictures import (
     shrunk,
     with_unique_names,
 )
-from vg2gt.io.cameras_json import NamedCamera, Photo, read_cameras_json
+from vg2gt.io.cameras_json import NamedCamera, Photo
 from vg2gt.io.errors import FormatError, some
 from vg2gt.io.files import composed, read_json
 from vg2gt.io.image_files import is_damaged, read_color
@@ -269,7 +270,7 @@ def _from_cameras_json(path: Path, folder: Path) -> list[Picture] | None:
     Raises:
         ValueError: if the file names none of the images.
     """
-    named = read_cameras_json(path)
+    named = cameras_of_json(path)
     cameras = _unique([(composed(Path(camera.name).name), camera) for camera in named])
     cameras |= _unique([(composed(camera.photo.name), camera) for camera in named if camera.photo is not None])
     by_stem = _unique([(Path(name).stem, camera) for name, camera in cameras.items()])

@@ -34,7 +34,15 @@ from vg2gt.inputs.damaged import name_left_out, readable
 from vg2gt.inputs.folders import image_files, is_photo
 from vg2gt.inputs.panoramas import Panorama, find_panoramas, whole_pixels
 from vg2gt.io.errors import some
-from vg2gt.io.image_files import focal_length, image_size, is_damaged, read_color, read_mask, read_mask_file
+from vg2gt.io.image_files import (
+    focal_length,
+    frame_count,
+    image_size,
+    is_damaged,
+    read_color,
+    read_mask,
+    read_mask_file,
+)
 from vg2gt.io.images import color_image, has_alpha
 from vg2gt.io.photogrammetry import is_camera_file
 from vg2gt.io.record3d import R3D, is_archive, read_recorded, recorded_files
@@ -46,6 +54,7 @@ ImagesLike: TypeAlias = "str | Path | Image.Image | NDArray[Any] | Tensor | Sequ
 
 T = TypeVar("T")
 
+_OF_SEVERAL = (".tif", ".tiff", ".png", ".webp", ".avif")  # files of pages or animations; MPO's others are previews
 _HOLDS_PICTURES = (*PHOTO_SUFFIXES, R3D)
 VIDEO_FRAMES = 32  # frames taken from a video by default
 MOST_FRAMES = 1000  # frames taken from a video at most
@@ -244,6 +253,9 @@ def _pictures(item: Any, max_images: int | None, faults: dict[str, str]) -> list
 def _photos(files: Sequence[Path], faults: dict[str, str]) -> list[Picture]:
     """Returns photographs, panoramas as the faces of a cube; what is wrong with others is added to ``faults``."""
     photos = readable(files, _photo, faults)
+    several = [file.name for file in photos if file.suffix.lower() in _OF_SEVERAL and frame_count(file) > 1]
+    if several:
+        log.warning("%d files hold several pictures, of which the first is used: %s", len(several), some(several))
     panoramas = find_panoramas([(file, photo.size) for file, photo in photos.items()])
     if panoramas:
         first = next(iter(panoramas)).name

@@ -62,6 +62,15 @@ def is_damaged(path: Path) -> bool:
     return False
 
 
+def frame_count(path: Path) -> int:
+    """Returns the number of pictures in an image file, such as the pages of a TIFF; 1 if it cannot be told."""
+    try:
+        with _opened(path, "") as image:
+            return int(getattr(image, "n_frames", 1))
+    except (DataError, *_DAMAGED):
+        return 1
+
+
 def focal_length(path: Path, size: Size) -> float | None:
     """Returns the focal length of a photograph in pixels, from the 35 mm equivalent in its EXIF data.
 
