@@ -7,8 +7,9 @@ from PIL import Image
 from scipy import ndimage
 
 from vg2gt.inputs import pictures
+from vg2gt.inputs.distinct import with_unique_names
 from vg2gt.inputs.inputs import load_views, working_size
-from vg2gt.inputs.pictures import Picture, find_pictures, shrunk, with_unique_names
+from vg2gt.inputs.pictures import Picture, find_pictures, shrunk
 from vg2gt.io import read_video, video, write_video
 from vg2gt.monitor import Monitor
 

@@ -114,7 +114,7 @@ def test_pictures_without_a_visible_pixel_or_with_a_broken_mask(tmp_path: Path, 
     Image.fromarray(masks["half"][:, :90]).save(tmp_path / "masks" / "other.png")
     assert [picture.name for picture in usable_pictures(find_pictures(tmp_path), Monitor())] == ["all", "half"]
     assert "hidden is hidden by its mask" in caplog.text
-    assert f"broken cannot be read (its mask {tmp_path / 'masks' / 'broken.png'}: the file is empty" in caplog.text
+    assert f"broken cannot be read (cannot read {tmp_path / 'masks' / 'broken.png'}: the file is empty" in caplog.text
     assert f"other cannot be read (the mask {tmp_path / 'masks' / 'other.png'} is 90x96 pixels" in caplog.text
 
 

@@ -14,9 +14,10 @@ import numpy as np
 
 from vg2gt.data.base import DataError
 from vg2gt.data.sources.masks import AmbiguousMaskError
+from vg2gt.inputs.distinct import without_copies
 from vg2gt.inputs.foreign import unread_camera_files
 from vg2gt.inputs.given_cameras import LAYOUTS, describe, given_pictures
-from vg2gt.inputs.pictures import ImagesLike, Picture, as_items, check_pictures, find_pictures, without_copies
+from vg2gt.inputs.pictures import ImagesLike, Picture, as_items, check_pictures, find_pictures
 from vg2gt.inputs.sfm import find_cameras, require_pycolmap
 from vg2gt.inputs.usable import usable_pictures
 from vg2gt.io.errors import FormatError, some

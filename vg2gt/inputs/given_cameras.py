@@ -22,6 +22,7 @@ from vg2gt.data.sources.undistortion import size_on_disk, undistortion_of
 from vg2gt.geometry.cameras import resize_intrinsics
 from vg2gt.inputs.camera_files import cameras_of_json
 from vg2gt.inputs.damaged import read_each
+from vg2gt.inputs.distinct import with_unique_names
 from vg2gt.inputs.folders import image_files, image_folders, is_photo
 from vg2gt.inputs.foreign import camera_files_in, foreign_cameras
 from vg2gt.inputs.pictures import (
@@ -34,7 +35,6 @@ from vg2gt.inputs.pictures import (
     frame_of,
     mask_for,
     shrunk,
-    with_unique_names,
 )
 from vg2gt.io.cameras_json import NamedCamera, Photo
 from vg2gt.io.errors import FormatError, some

@@ -237,7 +237,7 @@ def read_mask_file(path: Path, scene: str, photo: Path, upright: bool = False) -
     try:
         mask = read_mask(path, scene, upright=upright, is_mask=True)
     except DataError as error:
-        raise DataError(f"its mask {path}: {error.__cause__ or error}; restore or remove it") from None
+        raise DataError(str(error)) from None  # the reason alone would not say that it is the mask
     if mask is None:
         return None
     with _opened(photo, scene) as image:
