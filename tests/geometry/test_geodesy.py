@@ -56,6 +56,24 @@ def test_position_of_a_photograph(tmp_path, position) -> None:
     assert gps_position(tmp_path / "a.jpg") == pytest.approx(position, abs=1e-5)
 
 
+@pytest.mark.parametrize(
+    ("side", "sign"), [("s", -1), ("South", -1), ("S\0\0", -1), (" S", -1), ("", None), ("?", None)]
+)
+def test_references_as_some_programs_write_them(tmp_path, side: str, sign: int | None) -> None:
+    """A sign that is not known is no position, rather than one on the other half of the Earth."""
+    exif = Image.Exif()
+    tags = ExifTags.GPS
+    exif[ExifTags.IFD.GPSInfo] = {
+        tags.GPSLatitudeRef: side,
+        tags.GPSLatitude: (46.0, 30.0, 0.0),
+        tags.GPSLongitudeRef: "E",
+        tags.GPSLongitude: (7.0, 0.0, 0.0),
+        tags.GPSAltitude: 100.0,
+    }
+    Image.new("RGB", (8, 8)).save(tmp_path / "a.jpg", exif=exif)
+    assert gps_position(tmp_path / "a.jpg") == (None if sign is None else (sign * 46.5, 7, 100))
+
+
 def test_scale_place_and_up_in_spite_of_outliers() -> None:
     generator = np.random.default_rng(0)
     flight = np.stack([np.tile(np.arange(8) * 20.0, 5), np.repeat(np.arange(5) * 25.0, 8), 60 + 0 * np.arange(40)], 1)

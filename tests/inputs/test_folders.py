@@ -45,10 +45,22 @@ def test_files_that_are_not_read_are_named(tmp_path: Path, caplog, monkeypatch) 
     for name in ("b.dng", "c.EXR", "d.gif", "e.mp4", "more/f.nef", "notes.txt", ".g.dng"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(b"1")
+    put(tmp_path / "elsewhere" / "images" / "1.jpg")
+    (tmp_path / "linked").symlink_to(tmp_path / "elsewhere" / "images")
+    (tmp_path / "elsewhere" / "report.json").write_text("{}")  # so that it is not searched itself
+    for name in ("g.MTS", "h.3gp"):
+        (tmp_path / name).write_bytes(b"1")
+    put(tmp_path / "a_depth.png")
+    (tmp_path / "i.jpg").symlink_to(tmp_path / "no longer there.jpg")
     assert len(find_pictures(tmp_path)) == 1
-    assert "not read: b.dng, c.EXR, d.gif, e.mp4, more/f.nef (save" in caplog.text
-    (tmp_path / "a.jpg").unlink()
+    named = "a_depth.png, b.dng, c.EXR, d.gif, e.mp4, g.MTS, h.3gp, i.jpg, linked/ (a link), more/f.nef"
+    assert f"not read: {named} (save" in caplog.text
+    for name in ("a.jpg", "a_depth.png"):
+        (tmp_path / name).unlink()
     with pytest.raises(ValueError, match=r"no images in .*; not read: b\.dng, c\.EXR"):
+        find_pictures(tmp_path)
+    put(tmp_path / "dense" / "1.jpg")
+    with pytest.raises(ValueError, match=r"not searched, by their names: dense/, elsewhere/"):
         find_pictures(tmp_path)
     monkeypatch.setattr("vg2gt.inputs.folders.features.check", lambda name: False)
     (tmp_path / "h.avif").write_bytes(b"1")

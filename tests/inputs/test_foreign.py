@@ -10,6 +10,7 @@ from tests.inputs.test_given_cameras import NAMES
 from tests.reconstruction.conftest import SIZE
 from vg2gt.cli import reconstruct as reconstruct_command
 from vg2gt.inputs.camera_files import read_cameras
+from vg2gt.inputs.cameras import pictures_for
 from vg2gt.inputs.foreign import matched
 from vg2gt.inputs.given_cameras import given_pictures
 from vg2gt.io.photogrammetry import ForeignCamera, read_photogrammetry
@@ -162,6 +163,25 @@ def test_the_lens_of_visualsfm_undistorts_what_is_measured() -> None:
         np.testing.assert_allclose(found, measured * 900 + [600, 400], atol=0.05)
 
 
+@pytest.mark.parametrize("kind", ["components", "chunks"])
+def test_worlds_of_metashape_are_not_mixed(folder: Path, frames, kind: str, caplog) -> None:
+    """Components without a transform, and chunks, have worlds of their own, which were taken for one."""
+    path = metashape(folder, frames.world_to_camera.double().numpy(), 90.0, np.array([55.5, 41.5]))
+    content = path.read_text()
+    if kind == "components":
+        content = content.replace("</component></components>", '</component><component id="1"/></components>')
+        content = content.replace('id="3" sensor_id="0" component_id="0"', 'id="3" sensor_id="0" component_id="1"')
+    else:
+        first, second = content.index('<camera id="3"'), content.index("</group>")
+        moved = f"<cameras>{content[first:second]}</cameras></chunk></document>"
+        sensors = content[content.index("<sensors>") : content.index("<cameras>")]
+        content = (content[:first] + content[second:]).replace("</document>", f"<chunk>{sensors}{moved}")
+    path.write_text(content)
+    assert [Path(camera.name).stem for camera in read_photogrammetry(path)] == ["008", "009", "010"]
+    assert f"{path} has several chunks or components" in caplog.text
+    assert "ignored: 011" in caplog.text
+
+
 def test_names_are_matched_by_folders_names_and_stems() -> None:
     cameras = [
         ForeignCamera(name, np.eye(4), None, (1.0, 1.0)) for name in ("C:\\p\\front\\1.JPG", "back/1.jpg", "2", "3.tif")
@@ -173,6 +193,25 @@ def test_names_are_matched_by_folders_names_and_stems() -> None:
     assert matched(cameras[:1], [Path("/x/a/1.jpg"), Path("/x/b/1.jpg")]) == {}  # either could be meant
 
 
+def test_files_of_cameras_in_the_folder_of_the_images(folder: Path, frames) -> None:
+    path = metashape(folder, frames.world_to_camera.double().numpy(), 90.0, np.array([55.5, 41.5]))
+    path.rename(folder / "images" / path.name)
+    assert [picture.source for picture in given_pictures(folder) or []] == [f"cameras.xml {folder / 'images'}"] * 4
+
+
+def test_files_that_may_have_cameras_are_named_if_they_are_not_read(folder: Path, model, monkeypatch, caplog) -> None:
+    """Exports of OpenMVG, Pix4D and others: structure from motion began without a word."""
+    names = ("a_calibrated_external_camera_parameters.txt", "export.csv", "notes.txt", "sfm_data.json")
+    for name in names:
+        (folder / name).write_text("Name,X,Y,Z")
+    monkeypatch.setattr("vg2gt.inputs.cameras.find_cameras", lambda pictures, *_: pictures)
+    for poses, said in (("sfm", False), ("auto", True)):
+        with pictures_for(model, folder, poses) as pictures:  # type: ignore[arg-type]
+            assert len(pictures) == 4
+        named = ", ".join(str(folder / name) for name in names if name != "notes.txt")
+        assert (f"not read as cameras: {named} (" in caplog.text) == said
+
+
 def test_files_that_do_not_fit_are_named(folder: Path, frames, tmp_path: Path) -> None:
     poses = frames.world_to_camera.double().numpy()
     path = metashape(folder, poses, 90.0, np.array([55.5, 41.5]))
@@ -181,6 +220,12 @@ def test_files_that_do_not_fit_are_named(folder: Path, frames, tmp_path: Path) -
         (whole[: len(whole) // 2], r"cameras\.xml: damaged file of cameras"),
         (whole.replace('type="frame"', 'type="spherical"'), "has the type spherical, which is not read"),
         (whole.replace("<f>90.0</f>", "<f>nan</f>"), "is not finite"),
+        (
+            whole.replace(f'width="{SIZE[1]}" height="{SIZE[0]}"', f'width="{SIZE[0]}" height="{SIZE[1]}"').replace(
+                "<f>", "<k1>0.01</k1><f>"
+            ),
+            r"008\.png is 112x84 pixels, but its camera is of 84x112",
+        ),
         (whole.replace("00", "77").replace("01", "77"), r"cameras\.xml names none of the 4 images"),
     ):
         path.write_text(text)

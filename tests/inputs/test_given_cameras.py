@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import unicodedata
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from tests.data.sources.layouts import room
 from tests.reconstruction.conftest import SIZE
 from vg2gt import io
 from vg2gt.cli import reconstruct as reconstruct_command
+from vg2gt.data.base import DataError
 from vg2gt.geometry.cameras import resize_intrinsics, unproject
 from vg2gt.inputs.cameras import pictures_for
 from vg2gt.inputs.given_cameras import given_pictures
@@ -55,6 +57,11 @@ def put_cameras(folder: Path, frames, names=NAMES, size=SIZE, intrinsics=None) -
     poses = frames.world_to_camera.double().numpy()
     cameras = [io.NamedCamera(name, size[1], size[0], k, pose) for name, pose in zip(names, poses, strict=False)]
     io.write_cameras_json(folder / "cameras.json", cameras)
+
+
+def put_nvm(folder: Path, frames) -> None:
+    rows = ["NVM_V3", "", str(len(NAMES)), *(f"images/{name}\t90 1 0 0 0 {i} 0 0 0 0" for i, name in enumerate(NAMES))]
+    (folder / "model.nvm").write_text("\n".join([*rows, "0", ""]))
 
 
 def check_cameras(pictures: list[Picture] | None, frames, kind: str) -> None:
@@ -208,6 +215,61 @@ def test_a_phones_export_is_read_at_the_size_of_its_photographs(needed: bool, tm
     loaded = pictures[1].read((30, 40))
     assert bool(loaded.depth.any()) == needed
     torch.testing.assert_close(loaded.world_to_camera[0], frames.world_to_camera[1], atol=1e-6, rtol=0)
+
+
+def test_cameras_of_3d_gaussian_splatting(folder: Path, frames, model) -> None:
+    """Its ``cameras.json`` next to the images: camera to world, names without an ending."""
+    entries = []
+    for number, (name, pose) in enumerate(zip(NAMES, frames.world_to_camera.double().numpy(), strict=True)):
+        place = np.linalg.inv(pose)
+        lens = {"width": SIZE[1], "height": SIZE[0], "fx": 90.0, "fy": 91.0}
+        found = {"position": place[:3, 3].tolist(), "rotation": place[:3, :3].tolist()}
+        entries.append({"id": number, "img_name": Path(name).stem, **lens, **found})
+    (folder / "cameras.json").write_text(json.dumps(entries))
+    pictures = given_pictures(folder) or []
+    assert [picture.name for picture in pictures] == [Path(name).stem for name in NAMES]
+    for picture, pose in zip(pictures, frames.world_to_camera.numpy(), strict=True):
+        np.testing.assert_allclose(picture.pose, pose, atol=1e-5)
+        np.testing.assert_allclose(picture.intrinsics, [[90, 0, 55.5], [0, 91, 41.5], [0, 0, 1]])
+    (folder / "cameras.json").write_text("[{}]")
+    with pytest.raises(DataError, match=r"cameras\.json: \[0\].*--poses sfm"):
+        pictures_for(model, folder).__enter__()
+
+
+@pytest.mark.parametrize("place", [0.0, 5e6])
+def test_cameras_at_one_place_are_refused(place: float, folder: Path, frames, model) -> None:
+    """A file of poses that was never filled in: a scene of nothing but noise came out."""
+    moved = frames.world_to_camera.double().clone()
+    left, _, right = torch.linalg.svd(moved[:, :3, :3])
+    moved[:, :3, :3] = left @ right  # exactly
+    moved[:, :3, 3] = -moved[:, :3, :3].sum(-1) * place
+    put_transforms(folder, replace(frames, world_to_camera=moved))
+    with (
+        pytest.raises(DataError, match=r"all 4 cameras of Nerfstudio .* are at one place"),
+        pictures_for(model, folder),
+    ):
+        pass
+    moved[:, 0, 3] += torch.arange(4) * max(place, 1) * 1e-6
+    put_transforms(folder, replace(frames, world_to_camera=moved))
+    with pictures_for(model, folder) as pictures:
+        assert len(pictures) == 4
+
+
+@pytest.mark.parametrize("put", [put_transforms, put_cameras, put_nvm])
+def test_umlauts_as_macos_writes_them(put, folder: Path, frames) -> None:
+    """Composed in the file of cameras, decomposed in names of files and of their folder."""
+    put(folder, frames)
+    for name in NAMES:
+        (folder / "images" / name).rename(folder / "images" / unicodedata.normalize("NFD", f"Küche {name}"))
+    file = next(each for each in folder.iterdir() if each.suffix in (".json", ".nvm"))
+    text = file.read_text()
+    for name in NAMES:
+        text = text.replace(name, f"Küche{chr(34) if file.suffix == '.nvm' else ' '}{name}")
+    file.write_text(text, encoding="utf-8")
+    pictures = given_pictures(folder) or []
+    assert [unicodedata.normalize("NFC", picture.name) for picture in pictures] == [
+        f"Küche {Path(name).stem}" for name in NAMES
+    ]
 
 
 @pytest.mark.parametrize("put", [put_transforms, put_cameras])

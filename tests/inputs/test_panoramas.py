@@ -8,6 +8,7 @@ from PIL import Image
 
 from vg2gt.inputs.panoramas import FACES, continues
 from vg2gt.inputs.pictures import find_pictures
+from vg2gt.io.video import write_video
 
 SIZE = (256, 512)
 NOTE = '<x:xmpmeta><rdf:Description GPano:ProjectionType="equirectangular" {}/></x:xmpmeta>'
@@ -106,3 +107,22 @@ def test_photographs_of_this_shape_are_no_panoramas(tmp_path: Path) -> None:
         Image.fromarray(pixels.clip(0, 255).astype(np.uint8)).save(tmp_path / f"{name}.png")
         assert not continues(tmp_path / f"{name}.png")
     assert [picture.size for picture in find_pictures(tmp_path)] == [(128, 256)] * 4
+
+
+def test_videos_of_360_degree_cameras_are_cut_alike(tmp_path: Path, caplog) -> None:
+    """Their frames were taken for photographs twice as wide as high."""
+    pytest.importorskip("av")
+    path = write_video(tmp_path / "walk.mp4", [np.roll(sphere(), 16 * i, 1) for i in range(6)])
+    pictures = find_pictures(path, max_images=12)
+    assert [picture.name for picture in pictures] == [
+        f"walk-{n}-{name}" for n in ("000000", "000005") for name in FACES
+    ]
+    assert f"{path} is a 360 degree video" in caplog.text
+    for picture, name in zip(pictures, FACES, strict=False):
+        assert (picture.size, picture.focal, picture.path, picture.container) == ((128, 128), 64, None, path)
+        found = picture.read(picture.size).images[0].permute(1, 2, 0).numpy() * 255
+        assert np.abs(found - expected_face(name, 128)).mean() < 8  # of H.264
+    caplog.clear()
+    write_video(path, [sphere((512, 1024))[128:256, 100 + i : 356 + i] for i in range(6)])
+    assert [picture.size for picture in find_pictures(path)] == [(128, 256)] * 6
+    assert not caplog.text

@@ -7,8 +7,9 @@ from PIL import Image
 from scipy import ndimage
 
 from vg2gt.inputs import pictures
+from vg2gt.inputs.distinct import with_unique_names
 from vg2gt.inputs.inputs import load_views, working_size
-from vg2gt.inputs.pictures import Picture, find_pictures, shrunk, with_unique_names
+from vg2gt.inputs.pictures import Picture, find_pictures, shrunk
 from vg2gt.io import read_video, video, write_video
 from vg2gt.monitor import Monitor
 
@@ -83,6 +84,8 @@ def test_a_reduced_photograph_fits_its_camera() -> None:
 def test_numbers_make_names_unique() -> None:
     pictures = [Picture(name, (8, 8), lambda size: None) for name in ("a", "a", "a-000")]  # type: ignore[arg-type]
     assert [each.name for each in with_unique_names(pictures)] == ["a-001", "a-002", "a-000"]
+    twins = [Picture(name, (8, 8), lambda size: None) for name in ("A", "a", "B", "A-000")]  # type: ignore[arg-type]
+    assert [each.name for each in with_unique_names(twins)] == ["A-001", "a-002", "B", "A-000"]
 
 
 def test_working_size() -> None:
@@ -100,11 +103,24 @@ def test_working_size() -> None:
             working_size([(60, 50)], 14, "cpu", size)
 
 
-def test_files_that_cannot_be_used_are_refused(tmp_path: Path, monkeypatch) -> None:
-    (tmp_path / "IMG.HEIC").touch()
+@pytest.mark.parametrize("suffix", ["webp", "png"])
+def test_files_of_several_pictures_are_named(tmp_path: Path, suffix: str, caplog) -> None:
+    pages = [Image.fromarray(np.full((8, 8, 3), 90 * i, np.uint8)) for i in range(3)]
+    pages[0].save(tmp_path / f"a.{suffix}", save_all=True, append_images=pages[1:])
+    pages[0].save(tmp_path / "b.png")
+    assert len(find_pictures(tmp_path)) == 2
+    assert f"1 files hold several pictures, of which the first is used: a.{suffix}" in caplog.text
+
+
+@pytest.mark.parametrize("name", ["IMG.HEIC", "IMG.jpg"])
+def test_heic_names_its_package(tmp_path: Path, monkeypatch, name: str) -> None:
+    """Known by its content: a cloud's ``.jpg`` that is HEIC was "not an image"."""
+    Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(tmp_path / "other.png")
+    (tmp_path / name).write_bytes(b"\0\0\0\x18ftypheic\0\0\0\0mif1heic" + bytes(100))
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(ValueError, match="pip install pillow-heif"):
-        find_pictures(tmp_path / "IMG.HEIC")
+    for given in (tmp_path, tmp_path / name):
+        with pytest.raises(ImportError, match=f"{name} is HEIC: pip install pillow-heif, or save it as JPEG"):
+            find_pictures(given)
 
 
 def test_what_is_no_image() -> None:

@@ -31,12 +31,16 @@ def spoil(path: Path, how: str) -> None:
     """Damages an image in one of the ways that people have."""
     with Image.open(path) as image:
         size, whole = image.size, image.convert("RGB")
+    if how == "zeros":  # an interrupted copy; what comes after the end of an image does not matter
+        content = path.read_bytes()
+        path.write_bytes(content[: len(content) // 2].ljust(len(content), b"\0"))
+        return
     if how in ("empty", "cut"):
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2 if how == "cut" else 0])
         return
     rng = np.random.default_rng(0)
-    noise = rng.integers(0, 9, (size[1], size[0], 3))  # of the sensor
-    dark, bright = noise.astype(np.uint8), (255 - noise // 3).astype(np.uint8)
+    noise = np.abs(rng.normal(0, 9, (size[1], size[0], 3)))  # of the sensor
+    dark, bright = noise.astype(np.uint8), (255 - noise / 4).astype(np.uint8)
     bright[:5, :20] = 100  # a rest that is not clipped
     moved = np.mean([np.roll(np.asarray(whole, np.float32), k, 1) for k in range(size[0] // 10)], 0)
     spoilt = {
@@ -44,7 +48,7 @@ def spoil(path: Path, how: str) -> None:
         "white": bright,
         "blur": np.asarray(whole.filter(ImageFilter.GaussianBlur(size[0] / 40))),
         "shake": moved.astype(np.uint8),
-        "grey": np.full_like(dark, 128),
+        "grey": (128 + noise / 2).astype(np.uint8),
     }
     Image.fromarray(spoilt[how]).save(path)
 
@@ -52,6 +56,7 @@ def spoil(path: Path, how: str) -> None:
 SAID = {
     "empty": "cannot be read (the file is empty)",
     "cut": "cannot be read (image file is truncated",
+    "zeros": "cannot be read (the end of the file is zeros",
     "black": "is black",
     "white": "is over-exposed",
     "blur": "is blurred",
@@ -66,6 +71,8 @@ def test_what_shows_nothing_is_left_out_by_name(tmp_path: Path, caplog) -> None:
         Image.fromarray(scenery(number, (288, 432))).save(tmp_path / f"{kind}.jpg", quality=92)
         if kind in SAID:
             spoil(tmp_path / f"{kind}.jpg", kind)
+    with (tmp_path / "good0.jpg").open("ab") as file:
+        file.write(bytes(5000))
     (tmp_path / "text.jpg").write_text("no image")
     found = usable_pictures(find_pictures(tmp_path), Monitor())
     assert [picture.name for picture in found] == [kind for kind in kinds if kind.startswith("good")]
@@ -90,6 +97,25 @@ def test_dark_and_bright_scenes_and_bare_walls_are_kept(tmp_path: Path, caplog) 
         assert len(kept) == len(pictures), folder
         assert all(picture.read(SHAPE).mask is None for picture in kept), folder
     assert not caplog.text
+
+
+def test_pictures_without_a_visible_pixel_or_with_a_broken_mask(tmp_path: Path, caplog) -> None:
+    (tmp_path / "masks").mkdir()
+    masks = {
+        "hidden": np.zeros(SHAPE, np.uint8),
+        "half": np.zeros(SHAPE, np.uint8),
+        "all": np.full(SHAPE, 255, np.uint8),
+    }
+    masks["half"][:, ::2] = 255
+    for number, name in enumerate(("hidden", "half", "all", "broken", "other")):
+        Image.fromarray(scenery(number)).save(tmp_path / f"{name}.png")
+        Image.fromarray(masks.get(name, masks["all"])).save(tmp_path / "masks" / f"{name}.png")
+    (tmp_path / "masks" / "broken.png").write_bytes(b"")
+    Image.fromarray(masks["half"][:, :90]).save(tmp_path / "masks" / "other.png")
+    assert [picture.name for picture in usable_pictures(find_pictures(tmp_path), Monitor())] == ["all", "half"]
+    assert "hidden is hidden by its mask" in caplog.text
+    assert f"broken cannot be read (cannot read {tmp_path / 'masks' / 'broken.png'}: the file is empty" in caplog.text
+    assert f"other cannot be read (the mask {tmp_path / 'masks' / 'other.png'} is 90x96 pixels" in caplog.text
 
 
 def test_nothing_left_is_an_error(tmp_path: Path) -> None:

@@ -130,6 +130,12 @@ def test_tags_without_a_profile(tmp_path: Path) -> None:
     tags = chunk(b"gAMA", 1 / 2.2) + chunk(b"cHRM", 0.3127, 0.329, 0.64, 0.33, 0.21, 0.71, 0.15, 0.06)
     (tmp_path / "a.png").write_bytes(content.getvalue()[:33] + tags + content.getvalue()[33:])
     assert _error(tmp_path / "a.png").mean() < 2
+    content = io.BytesIO()  # code points of Display P3, which take precedence over a profile
+    Image.fromarray(_in(P3, _coded)).save(content, "PNG", icc_profile=_profile(b"RGB ", NAMED))
+    data = b"cICP" + bytes([12, 13, 0, 1])
+    tags = struct.pack(">I", 4) + data + struct.pack(">I", zlib.crc32(data))
+    (tmp_path / "a.png").write_bytes(content.getvalue()[:33] + tags + content.getvalue()[33:])
+    assert _error(tmp_path / "a.png").mean() < 2
 
 
 def _hlg(light: np.ndarray) -> np.ndarray:

@@ -80,8 +80,19 @@ def test_a_mask_of_stored_pixels_is_turned_with_its_photograph(tmp_path: Path) -
     Image.fromarray(stored).save(tmp_path / "photo.png", exif=exif)
     for mask in (stored, upright):
         Image.fromarray(mask).save(tmp_path / "mask.png")
-        assert np.array_equal(read_mask_file(tmp_path / "mask.png", "", tmp_path / "photo.png"), upright / 255)
-    assert read_mask_file(tmp_path / "mask.png", "").shape == (30, 20)
+        assert np.array_equal(read_mask_file(tmp_path / "mask.png", "", tmp_path / "photo.png", True), upright / 255)
+
+
+@pytest.mark.parametrize("size", [(20, 30), (10, 15), (40, 60), (7, 10), (20, 20), (30, 20), (20, 40)])
+def test_a_mask_of_another_shape_is_refused(tmp_path: Path, size: tuple[int, int]) -> None:
+    """A resized mask fits; one of a cropped or padded image would hide other pixels than was meant."""
+    Image.fromarray(np.zeros((20, 30, 3), np.uint8)).save(tmp_path / "photo.png")
+    Image.fromarray(np.zeros(size, np.uint8)).save(tmp_path / "mask.png")
+    if size[0] * 3 in (size[1] * 2, size[1] * 2 + 1):
+        assert read_mask_file(tmp_path / "mask.png", "", tmp_path / "photo.png").shape == size
+        return
+    with pytest.raises(DataError, match=rf"mask.png is {size[1]}x{size[0]} pixels, but its image .*photo.png is 30x20"):
+        read_mask_file(tmp_path / "mask.png", "", tmp_path / "photo.png")
 
 
 RAMP = np.linspace(0, 65535, 24 * 32).reshape(24, 32)

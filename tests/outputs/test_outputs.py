@@ -144,6 +144,28 @@ def test_names_of_244_characters_and_folders_of_cameras_are_kept(folder: Path, f
     assert (tmp_path / "out" / "color" / Path(names[1]).name).is_file()
 
 
+def test_files_do_not_replace_each_other_where_case_is_ignored(folder: Path, frames, model, tmp_path: Path) -> None:
+    """Windows and macOS: ``IMG_1.png``, ``img_1.png`` and ``IMG_1.PNG``."""
+    names, twins = ["IMG_1.png", "img_1.png", "IMG_1.PNG"], tmp_path / "twins"
+    (twins / "images").mkdir(parents=True)
+    for number, name in enumerate(names):
+        shutil.copy(folder / "images" / f"{8 + number:03d}.png", twins / "images" / name)
+    cameras = Cameras(frames.world_to_camera[None, :3].double(), frames.intrinsics[None, :3].double(), (84, 112))
+    io.write_colmap(twins / "sparse" / "0", io.colmap_from_views(cameras, names))
+    reconstruct_with(model, twins).save(tmp_path / "out", ["colmap", "nerfstudio", "color.png"])
+    for place in ("colmap/images", "nerfstudio/images", "color"):
+        assert len({path.name.lower() for path in (tmp_path / "out" / place).iterdir()}) == 3
+    exported = tmp_path / "out" / "colmap"
+    poses = {
+        (twins / "images" / name).read_bytes(): pose
+        for name, pose in zip(names, frames.world_to_camera.numpy(), strict=False)
+    }
+    for image in io.colmap_images(io.read_colmap(exported / "sparse" / "0")):
+        pose = poses.pop((exported / "images" / image.name).read_bytes())
+        np.testing.assert_allclose(io.colmap_pose(image), pose, atol=1e-4)
+    assert not poses
+
+
 def test_a_full_disk_is_noticed_before_any_work(folder: Path, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 10**9 - 10**6, 10**6))  # type: ignore[attr-defined]
     monkeypatch.setattr("vg2gt.runs.load.build_model", lambda *_: pytest.fail("built a model"))

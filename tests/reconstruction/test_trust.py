@@ -102,6 +102,8 @@ def test_reports_say_it(written: Path, stated: Scene, scene: Scene) -> None:
     lonely.__dict__["gaussian_trust"] = {"support": torch.full((len(stated.gaussians),), Status.SINGLE)}
     assert trust_lines(lonely)[0].startswith("Gaussians: 0 % are confirmed")
     assert "take more photographs" in trust_lines(lonely)[1]
+    for source, said in (("Nerfstudio room", True), ("structure from motion, 4 of 4 images", False)):
+        assert ("--poses sfm" in trust_lines(replace(lonely, cameras_from=source))[1]) == said
 
 
 def test_what_is_not_trusted_is_left_out(stated: Scene) -> None:

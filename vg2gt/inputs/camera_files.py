@@ -48,6 +48,16 @@ def read_cameras(path: str | Path) -> list[NamedCamera]:
     content = read_json(path)
     if isinstance(content, dict) and "frames" in content:
         return _of_transforms(path)
+    return cameras_of_json(path)
+
+
+def cameras_of_json(path: Path) -> list[NamedCamera]:
+    """Reads a ``cameras.json`` of ours or of 3D Gaussian Splatting.
+
+    Raises:
+        FormatError: if it is damaged or of another kind.
+    """
+    content = read_json(path)
     if isinstance(content, list) and content and isinstance(content[0], dict) and "img_name" in content[0]:
         return [_of_3dgs(f"{path}: [{index}]", entry) for index, entry in enumerate(content)]
     return read_cameras_json(path)

@@ -3,21 +3,31 @@
 from __future__ import annotations
 
 import importlib.util
+import logging
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal, get_args
 
+import numpy as np
+
 from vg2gt.data.base import DataError
 from vg2gt.data.sources.masks import AmbiguousMaskError
+from vg2gt.inputs.distinct import without_copies
+from vg2gt.inputs.foreign import unread_camera_files
 from vg2gt.inputs.given_cameras import LAYOUTS, describe, given_pictures
-from vg2gt.inputs.pictures import ImagesLike, Picture, check_pictures, find_pictures, without_copies
+from vg2gt.inputs.pictures import ImagesLike, Picture, as_items, check_pictures, find_pictures
 from vg2gt.inputs.sfm import find_cameras, require_pycolmap
 from vg2gt.inputs.usable import usable_pictures
+from vg2gt.io.errors import FormatError, some
 from vg2gt.io.files import by_number
 from vg2gt.model import Reconstructor
 from vg2gt.monitor import Monitor
+
+log = logging.getLogger(__name__)
+
+_SAME_PLACE = 1e-9  # distance of cameras at one place, relative to that from the origin
 
 Poses = Literal["auto", "given", "sfm"]
 
@@ -72,6 +82,8 @@ def pictures_for(
     if poses != "sfm":
         given = _given_pictures(images, max_images, backend.needs_depth, poses)
     if given is not None:
+        if not backend.needs_depth:
+            _check_places(given)
         yield usable_pictures(without_copies(given), monitor)
         return
     if backend.needs_depth:
@@ -80,6 +92,8 @@ def pictures_for(
         raise ValueError(
             f"no cameras next to {describe(images)}: expected {LAYOUTS}; --poses sfm finds them from the images"
         )
+    if poses == "auto":
+        _name_unread(images)
     with tempfile.TemporaryDirectory(prefix="vg2gt-sfm-") as temporary:
         pictures = usable_pictures(without_copies(find_pictures(images, max_images)), monitor)
         place = {picture.name: number for number, picture in enumerate(pictures)}
@@ -114,13 +128,38 @@ def _given_pictures(images: ImagesLike, max_images: int | None, depth: bool, pos
     """Returns :func:`given_pictures`; its errors name ``--poses sfm`` where structure from motion is a way out."""
     try:
         return given_pictures(images, max_images, depth=depth)
-    except DataError as error:
+    except (DataError, FormatError) as error:
         if poses == "given" or depth or isinstance(error, AmbiguousMaskError):
             raise
         raise DataError(
             f"cannot use the camera files of {describe(images)}: {error}; --poses sfm ignores them and finds the "
             "cameras from the images"
         ) from error
+
+
+def _check_places(pictures: Sequence[Picture]) -> None:
+    """Checks that given cameras are at different places.
+
+    Raises:
+        DataError: if all are at one, from which depth cannot be seen.
+    """
+    poses = [picture.pose for picture in pictures if picture.pose is not None]
+    if len(poses) < 2 or len(poses) < len(pictures):
+        return
+    centers = np.stack([-pose[:3, :3].T @ pose[:3, 3] for pose in poses])
+    if np.ptp(centers, axis=0).max() <= _SAME_PLACE * max(float(np.abs(centers).max()), 1e-3):
+        raise DataError(
+            f"all {len(poses)} cameras of {pictures[0].source} are at one place, from which depth cannot be seen: "
+            "correct their positions, or leave them out with --poses sfm"
+        )
+
+
+def _name_unread(images: ImagesLike) -> None:
+    """Warns about files next to the images that may have cameras but are not read."""
+    paths = [Path(item).expanduser() for item in as_items(images) if isinstance(item, (str, Path))]
+    folders = dict.fromkeys(path if path.is_dir() else path.parent for path in paths)
+    if files := [str(file) for folder in folders for file in unread_camera_files(folder)]:
+        log.warning("the cameras are found from the images; not read as cameras: %s (%s are)", some(files), LAYOUTS)
 
 
 def _no_depth(backend: str, images: ImagesLike) -> str:

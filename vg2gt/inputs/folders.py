@@ -9,6 +9,7 @@ from pathlib import Path
 
 from PIL import features
 
+from vg2gt.data.sources.masks import image_beside, image_of_mask
 from vg2gt.data.sources.parsing import IMAGE_FOLDERS, OTHER_FOLDERS, PHOTO_SUFFIXES, is_image_folder
 from vg2gt.io.errors import some
 from vg2gt.io.files import by_number
@@ -19,9 +20,13 @@ log = logging.getLogger(__name__)
 
 # Images that are not read as photographs, and those that cameras store in addition to or instead of them.
 _OTHER_SUFFIXES = (
-    *(".arw", ".cr2", ".cr3", ".dng", ".exr", ".gif", ".hdr", ".insp", ".jp2", ".j2k", ".jxl", ".nef", ".orf", ".pef"),
-    *(".psd", ".raf", ".raw", ".rw2", ".srw", ".svg", ".tga", ".insv", ".lrv", R3D, *VIDEO_SUFFIXES),
+    *(".exr", ".gif", ".hdr", ".hif", ".insp", ".j2k", ".jp2", ".jxl", ".jxr", ".psb", ".psd", ".svg", ".tga", ".xcf"),
+    *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".gpr", ".iiq", ".kdc", ".mef", ".mos", ".mrw"),
+    *(".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw", ".x3f"),
+    *(".360", ".3gp", ".flv", ".insv", ".lrv", ".m2ts", ".mpeg", ".mpg", ".mts", ".mxf", ".ogv", ".ts", ".wmv"),
+    *(R3D, *VIDEO_SUFFIXES),
 )
+_DEPTH = ("_depth", "-depth", ".depth")  # in the names of depth images next to photographs
 _RESULTS = ("report.json", "sfm.json", "scene.ply")  # in folders that vg2gt has written
 
 
@@ -48,7 +53,10 @@ def image_files(folder: Path, warn: bool = False) -> list[Path]:
     taken = max(found, key=lambda place: len(found[place]))  # the first of equals
     if not found[taken]:
         suffixes = ", ".join(PHOTO_SUFFIXES)
-        raise ValueError(f"no images in {folder} (looked for {suffixes}, there and in its subfolders){_others(folder)}")
+        folders = sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
+        skipped = [f"{path.name}/" for path in folders if _is_skipped(path)]
+        others = _others(folder) + (f"; not searched, by their names: {some(skipped)}" if skipped else "")
+        raise ValueError(f"no images in {folder} (looked for {suffixes}, there and in its subfolders){others}")
     if warn:
         _name_passed_over(folder, taken, found)
     return sorted(found[taken], key=lambda file: (len(file.relative_to(taken).parts) > 1, by_number(str(file))))
@@ -73,26 +81,38 @@ def image_folders(folder: Path) -> list[Path]:
 
 
 def _can_read(path: Path) -> bool:
-    """Returns whether the installed Pillow can read a photograph's format, by its suffix."""
-    return path.suffix.lower() != ".avif" or bool(features.check("avif"))
+    """Returns whether a photograph exists, not only a link, and the installed Pillow can read its format."""
+    return path.exists() and (path.suffix.lower() != ".avif" or bool(features.check("avif")))
 
 
 def _photos(folder: Path, without: list[Path]) -> list[Path]:
-    return [file for file in _walk(folder, without) if is_photo(file) and _can_read(file)]
+    found = [file for file in _walk(folder, without) if is_photo(file) and _can_read(file)]
+    return [file for file in found if image_of_mask(file) is None and image_beside(file, _DEPTH) is None]
 
 
 def _others(folder: Path) -> str:
     """Describes images and videos that are not read; empty if there are none."""
+    known = image_folders(folder)
     files = [
         str(file.relative_to(folder))
-        for file in _walk(folder, image_folders(folder))
-        if not file.name.startswith(".")
-        and (file.suffix.lower() in _OTHER_SUFFIXES or (is_photo(file) and not _can_read(file)))
+        for file in _walk(folder, known)
+        if (
+            not file.name.startswith(".")
+            and (file.suffix.lower() in _OTHER_SUFFIXES or (is_photo(file) and not _can_read(file)))
+        )
+        or image_beside(file, _DEPTH) is not None
     ]
+    links = [path for path in folder.iterdir() if path.is_symlink() and path.is_dir() and path not in known]
+    files += [f"{path.name}/ (a link)" for path in links if not OTHER_FOLDERS.fullmatch(path.name)]
     if not files:
         return ""
     named = some(sorted(files, key=by_number))
     return f"; not read: {named} (save photographs as JPEG or PNG, give a video by itself)"
+
+
+def _is_skipped(folder: Path) -> bool:
+    """Returns whether a folder holds other things than photographs, by its name or because vg2gt has written it."""
+    return bool(OTHER_FOLDERS.fullmatch(folder.name)) or any((folder / name).is_file() for name in _RESULTS)
 
 
 def _walk(folder: Path, without: list[Path]) -> Iterator[Path]:
@@ -100,9 +120,8 @@ def _walk(folder: Path, without: list[Path]) -> Iterator[Path]:
     folders = []
     for path in sorted(folder.iterdir()):
         if not path.is_dir():
-            yield from [path] if path.is_file() else []
-        elif path not in without and not path.is_symlink() and not OTHER_FOLDERS.fullmatch(path.name):
+            yield from [path] if path.is_file() or path.is_symlink() else []
+        elif path not in without and not path.is_symlink() and not _is_skipped(path):
             folders.append(path)
     for path in folders:
-        if not any((path / name).is_file() for name in _RESULTS):
-            yield from _walk(path, [])
+        yield from _walk(path, [])

@@ -13,16 +13,26 @@ from vg2gt.inputs.damaged import read_each
 from vg2gt.io.cameras_json import NamedCamera, Photo
 from vg2gt.io.colmap import colmap_intrinsics, require_pycolmap
 from vg2gt.io.errors import FormatError
-from vg2gt.io.image_files import image_size
+from vg2gt.io.files import composed
+from vg2gt.io.image_files import image_size, same_shape
 from vg2gt.io.photogrammetry import ForeignCamera, is_camera_file, read_photogrammetry
 
 _PLACES = (".", "bundle")  # subfolders with files of cameras
+# Of OpenMVG, OpenSfM, Meshroom, Pix4D, Metashape and RealityScan (other exports, projects), and any tables.
+_NAMED = ("sfm_data.json", "reconstruction.json", "_external_camera_parameters.txt", "_camera_parameters.txt")
+_MAYBE = (".abc", ".csv", ".nvm", ".out", ".p4d", ".psx", ".psz", ".rcproj", ".rsproj", ".sfm", ".xml")
 
 
 def camera_files_in(folder: Path) -> list[Path]:
     """Returns the files of cameras in a folder or its ``bundle/``."""
     places = [folder / place for place in _PLACES if (folder / place).is_dir()]
     return [file for place in places for file in sorted(place.iterdir()) if is_camera_file(file)]
+
+
+def unread_camera_files(folder: Path) -> list[Path]:
+    """Returns files in a folder that may have cameras, by their names, but are of no kind that is read."""
+    files = [file for file in sorted(folder.iterdir()) if file.is_file() and not is_camera_file(file)]
+    return [file for file in files if file.suffix.lower() in _MAYBE or any(map(file.name.endswith, _NAMED))]
 
 
 def matched(cameras: Sequence[ForeignCamera], files: Sequence[Path]) -> dict[Path, ForeignCamera]:
@@ -48,19 +58,24 @@ def _by_key(cameras: Sequence[ForeignCamera], parts: int, with_suffix: bool) -> 
 def _key(name: str, parts: int, with_suffix: bool) -> str:
     path = PurePosixPath(name.replace("\\", "/"))
     short = path.name if with_suffix else path.stem if path.suffix else path.name
-    return "/".join([*path.parts[:-1], short][-parts:]).lower()
+    return composed("/".join([*path.parts[:-1], short][-parts:]).lower())
 
 
 def named_camera(camera: ForeignCamera, name: str, size: tuple[int, int]) -> NamedCamera:
     """Returns a camera of an image of ``(height, width)`` as stored: that of its undistorted pinhole image.
 
     Raises:
-        ValueError: if the distortion is implausible.
+        ValueError: if the camera is of an image of another shape, or the distortion is implausible.
     """
     require_pycolmap("reading cameras of photogrammetry programs")
     import pycolmap  # pyright: ignore[reportMissingImports]
 
     height, width = camera.size or size
+    if not same_shape((height, width), size):
+        raise ValueError(
+            f"{name} is {size[1]}x{size[0]} pixels, but its camera is of {width}x{height}: use the images that the "
+            "cameras were made for, or resized ones"
+        )
     model, params = camera.lens((height, width))
     lens = pycolmap.Camera(model=model, width=width, height=height, params=params)
     if is_pinhole(lens):
@@ -82,6 +97,8 @@ def foreign_cameras(path: Path, files: Sequence[Path]) -> list[tuple[Path, Named
         return read_each(cameras, lambda file: (file, named_camera(cameras[file], file.name, image_size(file, ""))))
     except DataError:
         raise
+    except FormatError as error:
+        raise DataError(str(error)) from error
     except ValueError as error:
         raise DataError(f"{path}: {error}") from error
 

@@ -20,7 +20,9 @@ from vg2gt.data.sources.phone import app_of
 from vg2gt.data.sources.rgbd import RGBDFolder
 from vg2gt.data.sources.undistortion import size_on_disk, undistortion_of
 from vg2gt.geometry.cameras import resize_intrinsics
+from vg2gt.inputs.camera_files import cameras_of_json
 from vg2gt.inputs.damaged import read_each
+from vg2gt.inputs.distinct import with_unique_names
 from vg2gt.inputs.folders import image_files, image_folders, is_photo
 from vg2gt.inputs.foreign import camera_files_in, foreign_cameras
 from vg2gt.inputs.pictures import (
@@ -33,11 +35,10 @@ from vg2gt.inputs.pictures import (
     frame_of,
     mask_for,
     shrunk,
-    with_unique_names,
 )
-from vg2gt.io.cameras_json import NamedCamera, Photo, read_cameras_json
+from vg2gt.io.cameras_json import NamedCamera, Photo
 from vg2gt.io.errors import FormatError, some
-from vg2gt.io.files import read_json
+from vg2gt.io.files import composed, read_json
 from vg2gt.io.image_files import is_damaged, read_color
 from vg2gt.io.nerfstudio import read_transforms
 from vg2gt.io.photogrammetry import is_camera_file
@@ -269,17 +270,20 @@ def _from_cameras_json(path: Path, folder: Path) -> list[Picture] | None:
     Raises:
         ValueError: if the file names none of the images.
     """
-    named = read_cameras_json(path)
-    cameras = _unique([(Path(camera.name).name, camera) for camera in named])
-    cameras |= _unique([(camera.photo.name, camera) for camera in named if camera.photo is not None])
+    named = cameras_of_json(path)
+    cameras = _unique([(composed(Path(camera.name).name), camera) for camera in named])
+    cameras |= _unique([(composed(camera.photo.name), camera) for camera in named if camera.photo is not None])
     by_stem = _unique([(Path(name).stem, camera) for name, camera in cameras.items()])
     files = image_files(folder)
-    found = [(file, cameras.get(file.name) or by_stem.get(file.stem) or by_stem.get(file.name)) for file in files]
+    names = [composed(file.name) for file in files]
+    stems = [by_stem.get(Path(name).stem) or by_stem.get(name) for name in names]
+    found = [(file, cameras.get(name) or stem) for file, name, stem in zip(files, names, stems, strict=True)]
     known = [(file, camera) for file, camera in found if camera is not None]
     if not known:
         raise DataError(f"{path} names none of the {len(files)} images in {folder}, such as {files[0].name}")
     if any(
-        camera.photo and camera.photo.lens == UNKNOWN_LENS and camera.photo.name == file.name for file, camera in known
+        camera.photo and camera.photo.lens == UNKNOWN_LENS and composed(camera.photo.name) == composed(file.name)
+        for file, camera in known
     ):
         log.warning("%s describes undistorted images and is ignored for the photos in %s", path, folder)
         return None
@@ -301,7 +305,7 @@ def _of_camera_file(path: Path) -> list[Picture]:
 
 def _from_programs(place: Path, folder: Path, above: bool) -> list[Picture] | None:
     """Returns pictures of a folder with cameras of other programs; of several files, the one that names most counts."""
-    cameras = camera_files_in(place)
+    cameras = camera_files_in(place) + (camera_files_in(folder) if folder.resolve() != place.resolve() else [])
     if not cameras:
         return None
     files = image_files(folder)
@@ -319,7 +323,7 @@ def _from_programs(place: Path, folder: Path, above: bool) -> list[Picture] | No
 def _photo(path: Path, camera: NamedCamera, cameras: Path, as_stored: bool = False) -> Picture:
     """Returns a photograph with its camera, that of the whole photograph if the file has it."""
     photo = camera.photo
-    if photo is None or photo.name != path.name:
+    if photo is None or composed(photo.name) != composed(path.name):
         photo = Photo(path.name, camera.width, camera.height, camera.intrinsics)
     undistortion = undistortion_of(photo.lens) if photo.lens else None
     expected = undistortion.lens_size if undistortion else (photo.height, photo.width)

@@ -28,6 +28,7 @@ FACES = {
 }
 _HEAD = 1 << 18  # bytes that hold the metadata
 _WIDTH = 512  # pixels of the reduced image whose borders are compared
+_LEAST_HEIGHT = 64  # pixels of a panorama
 _CONTINUES = 0.5  # correlation of the detail along the left and the right border of a panorama
 _LESS = 0.2  # by which columns elsewhere correlate less
 _POLE = 0.5  # contrast of the first or last row, all of which is one point, relative to the middle
@@ -131,7 +132,11 @@ def find_panoramas(files: Sequence[tuple[Path, Size]]) -> dict[Path, Panorama]:
     border to the left one and have poles.
     """
     found = {path: known for path, size in files if (known := _described_panorama(path, size)) is not None}
-    others = [(path, size) for path, size in files if path not in found and size[1] == 2 * size[0] and size[0] >= 64]
+    others = [
+        (path, size)
+        for path, size in files
+        if path not in found and size[1] == 2 * size[0] and size[0] >= _LEAST_HEIGHT
+    ]
     if others and sum(continues(path) for path, _ in others) * 2 > len(others):
         found |= {path: Panorama(size, size) for path, size in others}
     return found
@@ -145,6 +150,22 @@ def continues(path: Path) -> bool:
             grey = np.asarray(image.convert("L").resize((_WIDTH, _WIDTH // 2), Image.Resampling.BOX), np.float64)
     except Exception:  # whoever reads it says what is wrong
         return False
+    return _continues(grey)
+
+
+def show_spheres(frames: Sequence[NDArray[np.uint8]]) -> bool:
+    """Returns whether images ``[H, W, 3]`` of a video are panoramas, by the borders of most of them."""
+    if not frames or not _has_shape(frames[0].shape):
+        return False
+    small = [Image.fromarray(each).convert("L").resize((_WIDTH, _WIDTH // 2), Image.Resampling.BOX) for each in frames]
+    return sum(_continues(np.asarray(each, np.float64)) for each in small) * 2 > len(small)
+
+
+def _has_shape(size: Sequence[int]) -> bool:
+    return size[1] == 2 * size[0] and size[0] >= _LEAST_HEIGHT
+
+
+def _continues(grey: NDArray[np.float64]) -> bool:
     detail = np.diff(grey, axis=0)
     left, right = detail[:, 0], detail[:, -1]
     if min(left.std(), right.std()) < 0.5:

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
-import importlib.util
-import itertools
 import logging
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,15 +16,31 @@ from torch import Tensor
 
 from vg2gt.data.base import Frames
 from vg2gt.data.sources.masks import FOLDER as MASKS
-from vg2gt.data.sources.masks import joined_masks, mask_beside, resized_mask, warn_without_mask
-from vg2gt.data.sources.parsing import HEIC_SUFFIXES, PHOTO_SUFFIXES
+from vg2gt.data.sources.masks import (
+    image_of_mask,
+    joined_masks,
+    mask_beside,
+    mask_folder,
+    resized_mask,
+    warn_without_mask,
+)
+from vg2gt.data.sources.parsing import PHOTO_SUFFIXES
 from vg2gt.data.sources.sparse_points import ObservedPoints
 from vg2gt.data.transforms import from_bytes, to_bytes
 from vg2gt.inputs.damaged import name_left_out, readable
-from vg2gt.inputs.folders import image_files, is_photo
-from vg2gt.inputs.panoramas import Panorama, find_panoramas, whole_pixels
+from vg2gt.inputs.distinct import with_unique_names
+from vg2gt.inputs.folders import image_files
+from vg2gt.inputs.panoramas import FACES, Panorama, find_panoramas, show_spheres, whole_pixels
 from vg2gt.io.errors import some
-from vg2gt.io.image_files import focal_length, image_size, is_damaged, read_color, read_mask, read_mask_file
+from vg2gt.io.image_files import (
+    focal_length,
+    frame_count,
+    image_size,
+    is_damaged,
+    read_color,
+    read_mask,
+    read_mask_file,
+)
 from vg2gt.io.images import color_image, has_alpha
 from vg2gt.io.photogrammetry import is_camera_file
 from vg2gt.io.record3d import R3D, is_archive, read_recorded, recorded_files
@@ -40,9 +52,11 @@ ImagesLike: TypeAlias = "str | Path | Image.Image | NDArray[Any] | Tensor | Sequ
 
 T = TypeVar("T")
 
+_OF_SEVERAL = (".tif", ".tiff", ".png", ".webp", ".avif")  # files of pages or animations; MPO's others are previews
 _HOLDS_PICTURES = (*PHOTO_SUFFIXES, R3D)
 VIDEO_FRAMES = 32  # frames taken from a video by default
 MOST_FRAMES = 1000  # frames taken from a video at most
+_FRAMES_LOOKED_AT = 5  # frames of a video that tell whether it is a panorama
 IN_MEMORY = 100  # maximum number of video frames kept in memory; with more, each is decoded on demand
 SFM_SOURCE = "structure from motion"  # prefix of the source of cameras found by it
 UNKNOWN_LENS = "unknown"  # lens of images that structure from motion has undistorted
@@ -105,15 +119,18 @@ def find_pictures(images: ImagesLike, max_images: int | None = None) -> list[Pic
         ValueError: if there is no picture (the message names where was searched), or none can be read.
     """
     faults: dict[str, str] = {}
-    chosen = [picture for item in as_items(images) for picture in _pictures(item, max_images, faults)]
+    items = [
+        item for item in as_items(images) if not isinstance(item, (str, Path)) or image_of_mask(Path(item)) is None
+    ]
+    chosen = [picture for item in items for picture in _pictures(item, max_images, faults)]
     name_left_out(faults, len(chosen) + len(faults))
     if not chosen:
         raise ValueError("there are no images to reconstruct; give image files, a folder of them, or a video")
     taken = evenly(chosen, max_images)
     photos = [picture.path for picture in taken if picture.path is not None]
     masks = {photo: mask_beside(photo) for photo in photos}
-    folders = {place / MASKS for photo in photos for place in (photo.parent, photo.parent.parent)}
-    known = sorted(str(folder) for folder in folders if folder.is_dir())
+    folders = {mask_folder(place) for photo in photos for place in (photo.parent, photo.parent.parent)}
+    known = sorted(str(folder) for folder in folders if folder is not None)
     if known or any(masks.values()):
         lacking = [str(photo) for photo, mask in masks.items() if mask is None]
         warn_without_mask(lacking, len(masks), (known or [MASKS])[0])
@@ -136,9 +153,7 @@ def check_pictures(paths: Sequence[str]) -> None:
     for path in found:
         if path.suffix.lower() in VIDEO_SUFFIXES:
             require_pyav(f"reading {path}")
-        elif path.is_file():
-            _allow_heic(path)
-        elif not any(file.suffix.lower() in _HOLDS_PICTURES for file in path.rglob("*")):
+        elif path.is_dir() and not any(file.suffix.lower() in _HOLDS_PICTURES for file in path.rglob("*")):
             image_files(path)
 
 
@@ -211,7 +226,7 @@ def mask_for(path: Path, upright: bool = True, content: bytes | None = None) -> 
     parts = [read_mask(path, "", content=content, upright=upright)]
     file = mask_beside(path)
     if content is None and file is not None:
-        parts.append(read_mask_file(file, "", path if upright else None))
+        parts.append(read_mask_file(file, "", path, upright))
     return joined_masks(parts)
 
 
@@ -230,13 +245,16 @@ def _pictures(item: Any, max_images: int | None, faults: dict[str, str]) -> list
             raise ValueError(f"{path} holds no images (rgbd/0.jpg and so on): is it a recording of Record3D?")
         return [_photo(file, read_recorded) for file in files.values()]
     if path.suffix.lower() in VIDEO_SUFFIXES:
-        return _video(path, max_images or VIDEO_FRAMES)
+        return _unrolled(_video(path, max_images or VIDEO_FRAMES), path, max_images)
     return _photos([path], faults)
 
 
 def _photos(files: Sequence[Path], faults: dict[str, str]) -> list[Picture]:
     """Returns photographs, panoramas as the faces of a cube; what is wrong with others is added to ``faults``."""
     photos = readable(files, _photo, faults)
+    several = [file.name for file in photos if file.suffix.lower() in _OF_SEVERAL and frame_count(file) > 1]
+    if several:
+        log.warning("%d files hold several pictures, of which the first is used: %s", len(several), some(several))
     panoramas = find_panoramas([(file, photo.size) for file, photo in photos.items()])
     if panoramas:
         first = next(iter(panoramas)).name
@@ -244,38 +262,38 @@ def _photos(files: Sequence[Path], faults: dict[str, str]) -> list[Picture]:
     return [
         picture
         for file, photo in photos.items()
-        for picture in (_faces(photo, file, panoramas[file]) if file in panoramas else [photo])
+        for picture in (_panorama_faces(photo, file, panoramas[file]) if file in panoramas else [photo])
     ]
 
 
-def _allow_heic(path: Path) -> None:
-    """Makes Pillow read HEIC if the file is one."""
-    if path.suffix.lower() not in HEIC_SUFFIXES:
-        return
-    if importlib.util.find_spec("pillow_heif") is None:
-        raise ValueError(f"{path} is HEIC and requires pillow-heif: pip install pillow-heif, or save it as JPEG")
-    from pillow_heif import register_heif_opener  # pyright: ignore[reportMissingImports]
+def _panorama_faces(photo: Picture, path: Path, panorama: Panorama) -> list[Picture]:
+    def pixels() -> NDArray[np.uint8]:
+        return whole_pixels(path, path.stat().st_mtime_ns)
 
-    register_heif_opener()
+    return _faces(photo.name, panorama, path, pixels, lambda: mask_for(path))
 
 
-def _faces(photo: Picture, path: Path, panorama: Panorama) -> list[Picture]:
+def _faces(
+    title: str,
+    panorama: Panorama,
+    container: Path,
+    whole: Callable[[], NDArray[np.uint8]],
+    mask: Callable[[], NDArray[np.float32] | None],
+) -> list[Picture]:
     """Returns the faces of a panorama; they have no file of their own."""
 
     def face(name: str) -> Picture:
         def read(size: tuple[int, int]) -> Frames:
-            pixels = panorama.cut(whole_pixels(path, path.stat().st_mtime_ns), name)
-            return frame_of(shrunk(pixels, size), panorama.cut_mask(mask_for(path), name))
+            return frame_of(shrunk(panorama.cut(whole(), name), size), panorama.cut_mask(mask(), name))
 
         side = panorama.side
-        return Picture(f"{photo.name}-{name}", (side, side), read, focal=side / 2, container=path)
+        return Picture(f"{title}-{name}", (side, side), read, focal=side / 2, container=container)
 
     return [face(name) for name in panorama.faces()]
 
 
 def _photo(path: Path, content_of: Callable[[Path], bytes | None] = lambda _: None) -> Picture:
     """Returns a photograph; ``content_of`` reads files inside an archive."""
-    _allow_heic(path)
 
     def read(size: tuple[int, int]) -> Frames:
         content = content_of(path)
@@ -309,6 +327,26 @@ def _video(path: Path, limit: int) -> list[Picture]:
     return [replace(each, container=path) for each in found]
 
 
+def _unrolled(frames: list[Picture], path: Path, limit: int | None) -> list[Picture]:
+    """Returns the frames of a video, those of a 360 degree camera as at most ``limit`` faces of a cube."""
+
+    def pixels(frame: Picture) -> NDArray[np.uint8]:
+        return to_bytes(frame.read(frame.size).images[0]).permute(1, 2, 0).numpy()
+
+    if not frames or frames[0].size[1] != 2 * frames[0].size[0]:
+        return frames
+    if not show_spheres([pixels(frame) for frame in evenly(frames, _FRAMES_LOOKED_AT)]):
+        return frames
+    size = frames[0].size
+    log.warning("%s is a 360 degree video; its frames are cut into cube faces", path)
+    chosen = evenly(frames, None if limit is None else max(limit // len(FACES), 1))
+    return [
+        face
+        for frame in chosen
+        for face in _faces(frame.name, Panorama(size, size), path, lambda frame=frame: pixels(frame), lambda: None)
+    ]
+
+
 def _in_memory(name: str, pixels: NDArray[np.uint8], mask: NDArray[np.float32] | None = None) -> Picture:
     def read(size: tuple[int, int]) -> Frames:
         return frame_of(shrunk(pixels, size), mask)
@@ -340,38 +378,3 @@ def _from_memory(item: Any) -> list[Picture]:
 def spread(count: int, limit: int) -> list[int]:
     """Returns ``limit`` of ``count`` positions, evenly spread, including the first and the last."""
     return [round(i * (count - 1) / max(limit - 1, 1)) for i in range(limit)]
-
-
-def with_unique_names(pictures: Sequence[Picture]) -> list[Picture]:
-    """Returns the pictures with a number appended to names that occur more than once."""
-    counts = Counter(picture.name for picture in pictures)
-    numbers = {name: itertools.count() for name, count in counts.items() if count > 1}
-
-    def unused(name: str) -> str:
-        return next(new for number in numbers[name] if (new := f"{name}-{number:03d}") not in counts)
-
-    return [replace(each, name=unused(each.name)) if each.name in numbers else each for each in pictures]
-
-
-def without_copies(pictures: Sequence[Picture]) -> list[Picture]:
-    """Returns the pictures without byte-identical copies of earlier image files, which are named in a warning."""
-    first: dict[str, str] = {}
-    found, copies = [], []
-    for picture in pictures:
-        key = digest(picture) if picture.path is not None and is_photo(picture.path) else None
-        if key in first:
-            copies.append(f"{picture.name} (as {first[key]})")
-            continue
-        found.append(picture)
-        if key is not None:
-            first[key] = picture.name
-    if copies:
-        log.warning("%d images are copies of others and are left out: %s", len(copies), some(copies))
-    return found
-
-
-def digest(picture: Picture) -> str:
-    """Returns the hash of a picture's file, or of its pixels if it has none."""
-    if picture.path is not None:
-        return hashlib.sha256(picture.path.read_bytes()).hexdigest()
-    return hashlib.sha256(to_bytes(picture.read(picture.size).images).numpy().tobytes()).hexdigest()

@@ -1,4 +1,4 @@
-"""Leaves out pictures that show nothing (damaged, black, over-exposed, blurred) and masks the black borders of others.
+"""Leaves out pictures that show nothing (damaged, black, blurred, hidden) and masks the black borders of others.
 
 Undistorted photographs have borders that are black in all images of a size and end abruptly. A dark background does
 neither: its edge differs from image to image.
@@ -28,10 +28,12 @@ log = logging.getLogger(__name__)
 
 _SIDE = 320  # longer side of the images that are looked at
 _BLACK, _WHITE = 12, 250  # values of 255 up to and from which a pixel shows nothing
+_NOISE = 4  # pixels over which noise is averaged
 _ALL, _NEARLY_ALL, _USUAL = 0.995, 0.9, 0.5  # shares of such pixels: always, or where most images have fewer than usual
 _FLAT = 1.0  # standard deviation of the brightness of an image that shows nothing
 _COARSE = (4, 16)  # pixels of structures that blur leaves
 _BLURRED = 0.03  # least detail of 1 pixel in the worst direction, relative to the coarse one and to the images' median
+_SHOWN = 0.001  # share of the pixels that a mask shows at least
 _FEWEST = 3  # images that are compared with each other
 _BORDER, _LIT = 6, 24  # values of 255 of a border at most, and of the image next to it at least
 _BORDERS = (0.001, 0.6)  # least and largest share of the pixels
@@ -97,10 +99,12 @@ def usable_pictures(pictures: Sequence[Picture], monitor: Monitor) -> list[Pictu
     with monitor.stage("check images", len(pictures)) as advance:
         for picture in pictures:
             try:
-                pixels = _small(picture)
+                pixels, shown = _small(picture)
             except DataError as error:
                 faults[picture.name] = reason_of(error)
             else:
+                if shown < _SHOWN:
+                    faults[picture.name] = "is hidden by its mask (white in masks is what counts)"
                 looks[picture.name] = _look(pixels)
                 if _may_have_borders(picture):
                     borders.setdefault(picture.size, _Borders(pixels.shape[:2])).add(pixels.max(2))
@@ -121,20 +125,27 @@ def _may_have_borders(picture: Picture) -> bool:
     return not picture.lens and not picture.has_depth
 
 
-def _small(picture: Picture) -> NDArray[np.uint8]:
-    """Reads a picture ``[h, w, 3]`` with a longer side of at most 320 pixels, its depth too if it has any."""
+def _small(picture: Picture) -> tuple[NDArray[np.uint8], float]:
+    """Reads a picture ``[h, w, 3]`` with a longer side of at most 320 pixels, its depth too if it has any.
+
+    Returns:
+        The pixels, and the share of them that its mask shows.
+    """
     scale = min(1.0, _SIDE / max(picture.size))
     height, width = (max(1, round(side * scale)) for side in picture.size)
-    pixels = to_bytes(picture.read((height, width)).images[0]).permute(1, 2, 0).numpy()
-    return np.asarray(Image.fromarray(pixels).resize((width, height), Image.Resampling.BOX))
+    frames = picture.read((height, width))
+    pixels = to_bytes(frames.images[0]).permute(1, 2, 0).numpy()
+    shown = 1.0 if frames.mask is None else float(frames.mask.mean())
+    return np.asarray(Image.fromarray(pixels).resize((width, height), Image.Resampling.BOX)), shown
 
 
 def _look(pixels: NDArray[np.uint8]) -> _Look:
     grey = pixels.mean(2, dtype=np.float32)
+    smooth = np.asarray(Image.fromarray(pixels).reduce(_NOISE)) if min(grey.shape) >= 16 * _NOISE else pixels
     fine, *coarse = (curvatures(grey, step) for step in (1, *_COARSE))
     detail = float((fine / np.maximum(np.max(coarse, 0), 1e-6)).min())
-    black, white = (pixels.max(2) <= _BLACK).mean(), (pixels.min(2) >= _WHITE).mean()
-    return _Look(float(black), float(white), float(grey.std()), detail)
+    black, white = (smooth.max(2) <= _BLACK).mean(), (smooth.min(2) >= _WHITE).mean()
+    return _Look(float(black), float(white), float(smooth.mean(2).std()), detail)
 
 
 def _faults(looks: dict[str, _Look]) -> dict[str, str]:

@@ -55,16 +55,17 @@ def to_srgb(image: Image.Image) -> Image.Image:
     A profile that cannot be read or does not fit the image is ignored with a warning.
     """
     profile = image.info.get("icc_profile")
-    if profile:
+    known = _code_points(image)
+    if profile and not (image.format == "PNG" and known):  # PNG's code points take precedence
         try:
             return _by_profile(image, profile)
         except (ImageCms.PyCMSError, OSError, ValueError, TypeError) as error:
             name = getattr(image, "filename", "") or "an image"
             log.warning("the colour profile of %s cannot be used (%s): its colours are taken as sRGB", name, error)
         return image
-    if image.mode not in ("RGB", "RGBA"):
+    if image.mode not in ("RGB", "RGBA", "P", "PA", "L", "LA"):
         return image
-    primaries, transfer = _code_points(image)
+    primaries, transfer = known or (1, 1)
     if needs_conversion(primaries, transfer):
         return Image.fromarray(coded_to_srgb(np.asarray(image.convert("RGB")), primaries, transfer))
     gamma, chromaticities = 1 / 2.2, _SRGB
@@ -119,14 +120,17 @@ def _transform(profile: bytes, mode: str) -> ImageCms.ImageCmsTransform | None:
     return None if shown and np.abs(np.asarray(shown).astype(int) - same).max() <= _NOTHING else transform
 
 
-def _code_points(image: Image.Image) -> tuple[int, int]:
-    """Returns the primaries and transfer function of an AVIF or HEIF file (its colour box); 1 of other images."""
+def _code_points(image: Image.Image) -> tuple[int, int] | None:
+    """Returns the primaries and transfer function of an AVIF or HEIF file (its colour box) or a PNG (cICP), if any."""
     name = getattr(image, "filename", "")
-    if image.format not in ("AVIF", "HEIF") or not name:
-        return 1, 1
+    layouts = {"AVIF": (b"colrnclx", ">HH"), "HEIF": (b"colrnclx", ">HH"), "PNG": (b"\0\0\0\4cICP", ">BB")}
+    if image.format not in layouts or not name:
+        return None
+    mark, values = layouts[image.format]
     with open(name, "rb") as file:
-        _, found, rest = file.read(1 << 16).partition(b"colrnclx")
-    return struct.unpack(">HH", rest[:4]) if found and len(rest) >= 4 else (1, 1)
+        _, found, rest = file.read(1 << 16).partition(mark)
+    size = struct.calcsize(values)
+    return struct.unpack(values, rest[:size]) if found and len(rest) >= size else None
 
 
 def _is_adobe(image: Image.Image) -> bool:

@@ -10,6 +10,7 @@ import re
 import secrets
 import shutil
 import stat
+import unicodedata
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -146,6 +147,11 @@ def read_json(path: str | Path, content: bytes | None = None) -> Any:
         return json.loads(regular(path).read_bytes() if content is None else content)
     except (ValueError, RecursionError) as error:
         raise FormatError(f"{path}: not valid JSON ({error}); the file is truncated or damaged") from error
+
+
+def composed(name: str) -> str:
+    """Returns a name with composed umlauts and accents: macOS decomposes them in names of files, others do not."""
+    return unicodedata.normalize("NFC", name)
 
 
 def by_number(name: str) -> tuple[list[str | int], str]:

@@ -35,6 +35,8 @@ _QUARTER_TURNS = (5, 6, 7, 8)
 _LARGE = 24_000_000  # pixels; larger images are decoded at reduced size where that suffices
 _DRAFT = 8  # largest reduction by the decoder
 _SAME_SHAPE = 0.02  # relative difference of aspect ratios of the same shape
+_START_OF_SCAN = 0xDA  # marker of JPEG
+_ZEROS = 64  # bytes at the end of a file that was cut off
 _FILM_DIAGONAL = math.hypot(36, 24)  # millimetres
 
 
@@ -58,6 +60,15 @@ def is_damaged(path: Path) -> bool:
     except DataError:
         return True
     return False
+
+
+def frame_count(path: Path) -> int:
+    """Returns the number of pictures in an image file, such as the pages of a TIFF; 1 if it cannot be told."""
+    try:
+        with _opened(path, "") as image:
+            return int(getattr(image, "n_frames", 1))
+    except (DataError, *_DAMAGED):
+        return 1
 
 
 def focal_length(path: Path, size: Size) -> float | None:
@@ -89,8 +100,11 @@ def gps_position(path: Path) -> tuple[float, float, float] | None:
         with open_image(path) as image:
             gps = image.getexif().get_ifd(ExifTags.IFD.GPSInfo)
         latitude, longitude = (
-            sum(float(part) / 60**power for power, part in enumerate(gps[angle])) * (-1 if gps[side] in "SW" else 1)
-            for angle, side in ((tags.GPSLatitude, tags.GPSLatitudeRef), (tags.GPSLongitude, tags.GPSLongitudeRef))
+            sum(float(part) / 60**power for power, part in enumerate(gps[angle])) * signs[_letter(gps[side])]
+            for angle, side, signs in (
+                (tags.GPSLatitude, tags.GPSLatitudeRef, {"N": 1, "S": -1}),
+                (tags.GPSLongitude, tags.GPSLongitudeRef, {"E": 1, "W": -1}),
+            )
         )
         is_below = gps.get(tags.GPSAltitudeRef, b"\0") in (b"\1", 1, 3)
         found = (latitude, longitude, float(gps[tags.GPSAltitude]) * (-1 if is_below else 1))
@@ -98,6 +112,12 @@ def gps_position(path: Path) -> tuple[float, float, float] | None:
         return None
     is_sound = abs(found[0]) <= 90 and abs(found[1]) <= 180 and all(map(math.isfinite, found))
     return found if is_sound and any(found[:2]) else None  # 0, 0 stands for no position
+
+
+def _letter(reference: str | bytes) -> str:
+    """Returns the first letter of a reference such as ``N``, which some programs pad, spell out or write small."""
+    text = reference.decode("ascii") if isinstance(reference, bytes) else reference
+    return text.strip(" \0")[:1].upper()
 
 
 def typical_size(sizes: Iterable[Size]) -> Size:
@@ -201,25 +221,40 @@ def _has_labels(image: Image.Image) -> bool:
     return bool((colors != colors[..., :1]).any())
 
 
-def read_mask_file(path: Path, scene: str, photo: Path | None = None) -> NDArray[np.float32] | None:
-    """Reads the mask file of an image (:func:`read_mask`).
+def read_mask_file(path: Path, scene: str, photo: Path, upright: bool = False) -> NDArray[np.float32] | None:
+    """Reads the mask file of an image (:func:`read_mask`); None: all pixels count.
 
     Args:
         path: the mask.
         scene: the scene it belongs to, for messages; empty: none.
-        photo: the photograph, if it is turned upright. A mask with the shape of the stored pixels, rather than of the
+        photo: the image.
+        upright: whether the image is turned upright. A mask with the shape of the stored pixels, rather than of the
             upright photograph, is turned along with it.
+
+    Raises:
+        DataError: if it cannot be read, or has another shape than the image.
     """
-    mask = read_mask(path, scene, upright=photo is not None, is_mask=True)
-    if mask is None or photo is None:
-        return mask
+    try:
+        mask = read_mask(path, scene, upright=upright, is_mask=True)
+    except DataError as error:
+        raise DataError(str(error)) from None  # the reason alone would not say that it is the mask
+    if mask is None:
+        return None
     with _opened(photo, scene) as image:
-        turn, (width, height) = _orientation(image), image.size
-    stored = abs(mask.shape[0] * width / (mask.shape[1] * height) - 1) < _SAME_SHAPE
-    upright = abs(mask.shape[0] * height / (mask.shape[1] * width) - 1) < _SAME_SHAPE
-    if turn not in _QUARTER_TURNS or upright or not stored:
+        turn, stored, turned = _orientation(image), _size(image, False), _size(image, upright)
+    if same_shape(mask.shape, turned):
         return mask
-    return np.array(_turned(Image.fromarray(mask), turn))
+    if same_shape(mask.shape, stored):
+        return np.array(_turned(Image.fromarray(mask), turn))
+    raise DataError(
+        f"the mask {path} is {mask.shape[1]}x{mask.shape[0]} pixels, but its image {photo} is {turned[1]}x{turned[0]}: "
+        "make it from the whole image"
+    )
+
+
+def same_shape(one: tuple[int, ...], other: tuple[int, ...]) -> bool:
+    """Returns whether an image of one ``(height, width)`` can be one of the other resized, rounded to whole pixels."""
+    return abs(one[0] * other[1] / (one[1] * other[0]) - 1) < max(_SAME_SHAPE, 2 / min(*one, *other))
 
 
 def orientation(path: Path, scene: str) -> int:
@@ -255,12 +290,33 @@ def _opened(path: Path, scene: str, content: bytes | None = None) -> Iterator[Im
     """Opens an image; errors while it is read become ``DataError`` with the file, the scene and a remedy."""
     try:
         with open_image(path if content is None else io.BytesIO(content)) as image:
+            if image.format in ("JPEG", "MPO") and content is None:
+                _check_end(path)
             yield image
     except DataError:
         raise
     except _DAMAGED as error:
         whose, remedy = (f" of scene {scene}", "remove the frame") if scene else ("", "leave it out")
         raise DataError(f"cannot read {path}{whose}: {error}; restore the file or {remedy}") from error
+
+
+def _check_end(path: Path) -> None:
+    """Checks that a JPEG file does not break off in zeros, as an interrupted copy does: decoders fill it with grey.
+
+    Raises:
+        OSError: if it does.
+    """
+    with path.open("rb") as file:
+        file.seek(-min(_ZEROS, path.stat().st_size), io.SEEK_END)
+        if any(file.read()):
+            return
+        file.seek(0)
+        data = file.read()
+    place = 2
+    while data[place : place + 1] == b"\xff" and data[place + 1] != _START_OF_SCAN:  # segments, with their length
+        place += 2 + int.from_bytes(data[place + 2 : place + 4], "big")
+    if b"\xff\xd9" not in data[place:]:
+        raise OSError("the end of the file is zeros: it was not copied as a whole")
 
 
 def _turned(picture: Image.Image, orientation: int) -> Image.Image:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import io
 import threading
 from collections.abc import Sequence
@@ -36,6 +37,8 @@ BACKGROUND = (255, 255, 255, 255)  # behind transparent pixels
 _FORMATS = ("PNG", "JPEG", "MPO", "PPM", "TIFF", "WEBP", "BMP", "GIF", "HEIF", "AVIF")
 
 
+_HEIC = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")  # brands; AVIF has avif
+
 MOST_PIXELS = 300_000_000  # of an image; Pillow's own limit is 179 million
 _opening = threading.Lock()
 
@@ -44,12 +47,14 @@ def open_image(file: str | Path | IO[bytes]) -> Image.Image:
     """Opens an image file lazily with Pillow, restricted to formats of photographs and depth images.
 
     Raises:
+        ImportError: if it is HEIC, under any name, and pillow-heif is not installed.
         OSError: if the file is missing, empty, not a regular file, of another format, or of more than 300 megapixels.
     """
     if isinstance(file, (str, Path)):
         regular(file)
         if not Path(file).stat().st_size:
             raise OSError("the file is empty")
+        _allow_heic(Path(file))
     Image.init()
     with _opening:  # Pillow's limit is global
         limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
@@ -63,6 +68,19 @@ def open_image(file: str | Path | IO[bytes]) -> Image.Image:
             f"it has {image.width}x{image.height} pixels, more than {MOST_PIXELS // 10**6} million: reduce it"
         )
     return image
+
+
+def _allow_heic(path: Path) -> None:
+    """Makes Pillow read HEIC if the file is one by its content: phones and clouds also name it ``.jpg``."""
+    with path.open("rb") as stream:
+        head = stream.read(12)
+    if head[4:8] != b"ftyp" or head[8:] not in _HEIC:
+        return
+    if importlib.util.find_spec("pillow_heif") is None:
+        raise ImportError(f"{path} is HEIC: pip install pillow-heif, or save it as JPEG")
+    from pillow_heif import register_heif_opener  # pyright: ignore[reportMissingImports]
+
+    register_heif_opener()
 
 
 def has_alpha(image: Image.Image) -> bool:

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from vg2gt.io.cameras_json import invert_pose
-from vg2gt.io.errors import FormatError
+from vg2gt.io.errors import FormatError, some
 from vg2gt.io.files import regular
 
 log = logging.getLogger(__name__)
@@ -122,18 +122,28 @@ def _metashape(path: Path, text: str) -> list[ForeignCamera]:
     if "<!DOCTYPE" in text:
         raise FormatError(f"{path}: a file of cameras has no document type definition")
     root = ElementTree.fromstring(text)  # noqa: S314  without definitions nothing expands
-    found = []
-    for chunk in root.iter("chunk"):
+    worlds: dict[tuple[int, str | None], list[ForeignCamera]] = {}
+    for number, chunk in enumerate(root.iter("chunk")):
         sensors = {sensor.get("id"): sensor for sensor in chunk.iter("sensor")}
-        moves = {part.get("id"): _similarity(part.find("transform")) for part in chunk.iter("component")}
-        whole = _similarity(chunk.find("transform"))
+        moves = {part.get("id"): part.find("transform") for part in chunk.iter("component")}
+        whole = chunk.find("transform")
         for camera in chunk.iter("camera"):
             place = camera.findtext("transform")
             if place is None or camera.get("enabled", "true").lower() in ("false", "0"):
                 continue
-            pose = moves.get(camera.get("component_id"), whole) @ np.array(place.split(), float).reshape(4, 4)
+            part = camera.get("component_id")
+            pose = _similarity(moves.get(part, whole)) @ np.array(place.split(), float).reshape(4, 4)
             pose[:3, :3] /= np.cbrt(np.linalg.det(pose[:3, :3]))
-            found.append(_of_sensor(path, camera.get("label", ""), sensors[camera.get("sensor_id")], invert_pose(pose)))
+            known = _of_sensor(path, camera.get("label", ""), sensors[camera.get("sensor_id")], invert_pose(pose))
+            # components without a transform share no world
+            worlds.setdefault((number, part if moves.get(part, whole) is None else None), []).append(known)
+    found = max(worlds.values(), key=len, default=[])
+    if len(worlds) > 1:
+        others = [camera.name for cameras in worlds.values() if cameras is not found for camera in cameras]
+        log.warning(
+            "%s has several chunks or components, each with a world of its own: the largest is used. Merge or align "
+            "them in Metashape; ignored: %s", path, some(others),
+        )  # fmt: skip
     return found
 
 

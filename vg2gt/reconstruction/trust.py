@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from vg2gt.inputs.camera_source import CameraSource
 from vg2gt.types import Prediction
 from vg2gt.uncertainty import STATED, Calibration
 from vg2gt.visibility import Status, pixel_evidence
@@ -24,6 +25,10 @@ _DOUBTS = {
     "unseen": "are seen by no view (unseen)",
 }
 _FEW = 0.5  # share of confirmed Gaussians below which the summary gives advice; a round number, not tuned
+_GIVEN = (
+    ", or the given cameras do not fit the images (axes of another convention, another order, inverted poses): --poses "
+    "sfm ignores them"
+)
 _COLORS = torch.tensor([[0.15, 0.15, 0.15], [0.45, 0.45, 0.45], [0.75, 0.1, 0.55]])  # unseen, guessed, contradicted
 _RAMP = torch.tensor([[0.1, 0.3, 0.75], [0.2, 0.7, 0.5], [0.95, 0.85, 0.2], [0.85, 0.2, 0.1]])
 _RAMP_ENDS = (0.003, 0.3)  # errors at its ends, logarithmic in between
@@ -123,7 +128,8 @@ def trust_lines(scene: Scene) -> list[str]:
     if rest:
         lines[0] += f"; {', '.join(rest)}; --drop removes what you name"
     if shares["agreed"] < _FEW:
-        lines.append("few views agree: take more photographs in smaller steps, or check that the cameras are right")
+        given = CameraSource.of(scene.cameras_from) is CameraSource.GIVEN
+        lines.append(f"few views agree: take more photographs in smaller steps{_GIVEN if given else ''}")
     if "error_of_pixels" not in figures:
         return [*lines, "depth errors are not stated: there is no calibration of this model (vg2gt calibrate)"]
     when = "depth before refinement" if scene.refined is not None else "depth"

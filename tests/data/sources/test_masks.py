@@ -34,11 +34,27 @@ def _put(*files: Path, hidden: str = "") -> None:
         ("drone/DCIM/100MEDIA/1.jpg", "masks/drone/DCIM/100MEDIA/1.png"),
         ("front/1.jpg", "masks/1.png"),  # no other folder of photographs has an image of that name
         ("images/1.jpg", "masks/1.png"),  # images_4 holds the same image
+        ("images/1.jpg", "Masks/1.PNG"),
+        ("1.jpg", "mask/1.tif"),
+        ("1.jpg", "masks/1_mask.png"),
+        ("1.jpg", "1_mask.png"),  # as drone programs have it
+        ("front/1.jpg", "front/1.jpg.mask.png"),
     ],
 )
 def test_where_masks_are(tmp_path: Path, image: str, mask: str) -> None:
     _put(*(tmp_path / name for name in (image, mask, "images_4/1.jpg", "thumbs/1.jpg", "depth/1.png")))
     assert mask_beside(tmp_path / image) == tmp_path / mask
+
+
+def test_masks_next_to_their_images_are_no_photographs(tmp_path: Path, caplog) -> None:
+    names = ("1.jpg", "2.jpg", "1_mask.png", "2.mask.png", "face_mask.png", "1_mask_2.jpg")
+    _put(*(tmp_path / name for name in names), hidden="left")
+    for given in (tmp_path, [tmp_path / name for name in names]):
+        found = find_pictures(given)
+        assert sorted(picture.name for picture in found) == ["1", "1_mask_2", "2", "face_mask"]
+        masks = {picture.name: picture.read((24, 32)).mask for picture in found}
+        assert [name for name, mask in masks.items() if mask is not None] == ["1", "2"]
+        assert "2 of 4 images have no mask" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -75,3 +91,21 @@ def test_cameras_of_transforms_with_nested_and_flat_masks(tmp_path: Path, caplog
     given = find_pictures([tmp_path / "front", tmp_path / "back"])
     masks = [picture.read((24, 32)).mask for picture in given]
     assert [None if each is None else each[0, 0, ::31].tolist() for each in masks] == [[0, 1], [1, 0]]
+
+
+def test_images_without_the_mask_that_others_name(tmp_path: Path, caplog) -> None:
+    """They have those of ``masks/``, and what has none is said."""
+    frames = [{"file_path": f"{i}.jpg", "transform_matrix": np.eye(4).tolist()} for i in range(3)]
+    frames[0]["mask_path"] = "hidden/a.png"
+    (tmp_path / "transforms.json").write_text(json.dumps({"w": 32, "h": 24, "fl_x": 30, "frames": frames}))
+    _put(*(tmp_path / f"{i}.jpg" for i in range(3)))
+    _put(tmp_path / "hidden" / "a.png", hidden="left")
+    for masks in (1, 2):
+        caplog.clear()
+        mask = Nerfstudio(str(tmp_path)).load(tmp_path.name, [0, 1, 2]).mask
+        assert mask is not None
+        assert [each[0, ::31].tolist() for each in mask] == [[0, 1], [1, 1] if masks == 1 else [1, 0], [1, 1]]
+        lacking = "1.jpg, 2.jpg" if masks == 1 else "2.jpg"
+        assert f"{4 - masks - 1} of 3 images have no mask" in caplog.text
+        assert caplog.text.strip().endswith(lacking)
+        _put(tmp_path / "masks" / "1.png", hidden="right")

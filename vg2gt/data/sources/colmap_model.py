@@ -92,7 +92,7 @@ class COLMAP(FileSource):
                 f"scene {scene}: none of the model's {len(records)} images is in {folder / self.images}; {names}. Copy "
                 "them there, or set data.images to the name of their folder"
             )
-        masks = find_masks(folder / MASKS, {i: records[i].name for i in color}, color, f"scene {scene}")
+        masks = find_masks(folder / MASKS, {i: records[i].name for i in color}, color, f"scene {scene}", {})
         damaged = there.keys() - color.keys()  # their names have been said
         poses = {i: invert_pose(colmap_pose(record)) for i, record in enumerate(records) if i not in damaged}
         posed: dict[int, PosedImage] = {}

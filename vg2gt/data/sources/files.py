@@ -163,7 +163,7 @@ class FileSource(SceneSource):
         color, upright = index.color[row], index.of_image("upright", row, False)
         parts = [read_mask(color, index.name, upright=upright)]
         if path := index.of_image("mask", row, ""):
-            parts.append(read_mask_file(Path(path), index.name, color if upright else None))
+            parts.append(read_mask_file(Path(path), index.name, color, upright))
         mask = joined_masks(parts)
         if mask is None or not (lens := index.lens(row)):
             return mask

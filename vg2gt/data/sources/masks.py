@@ -1,9 +1,14 @@
-"""Mask files: finds the mask of an image, and combines and resizes masks."""
+"""Mask files: finds the mask of an image, and combines and resizes masks.
+
+Masks are in a folder ``masks`` (or ``mask``, in any case), or next to their images as ``NAME_mask.png``.
+"""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +22,9 @@ from vg2gt.io.image_files import Size
 log = logging.getLogger(__name__)
 
 FOLDER = "masks"
-_ENDINGS = tuple(each for ending in (".png", ".jpg", ".jpeg", ".bmp") for each in (ending, ending.upper()))
+_FOLDERS = ("masks", "mask")
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+_MARKS = ("_mask", ".mask")  # between the name of an image and the suffix of its mask
 _LEVELS = 5  # folders above an image in which its masks are looked for
 
 
@@ -25,20 +32,88 @@ class AmbiguousMaskError(DataError):
     """A mask file may belong to several images."""
 
 
+def mask_folder(folder: Path) -> Path | None:
+    """Finds the folder of masks in a folder: ``masks`` or ``mask``, in any case; None if there is none."""
+    if (folder / FOLDER).is_dir():
+        return folder / FOLDER
+    try:
+        return _mask_folder(folder, folder.stat().st_mtime_ns)
+    except OSError:  # a folder above the images that cannot be listed
+        return None
+
+
+@lru_cache(maxsize=256)
+def _mask_folder(folder: Path, changed: int) -> Path | None:
+    """Looks a folder of masks up; another time ``changed`` of the folder invalidates the cache."""
+    with os.scandir(folder) as entries:
+        found = [entry.name for entry in entries if entry.name.lower() in _FOLDERS and entry.is_dir()]
+    return folder / min(found, key=lambda name: (_FOLDERS.index(name.lower()), name)) if found else None
+
+
 def mask_of(folder: Path, name: str) -> Path | None:
     """Finds the mask of an image: ``NAME.png`` as in COLMAP, the name with another suffix, or the same name.
+
+    ``_mask`` or ``.mask`` may be before the suffix.
 
     Args:
         folder: folder of masks.
         name: name of the image, relative to the image folder.
     """
-    stem = folder / name
-    candidates = [Path(f"{stem}.png"), Path(f"{stem}.PNG"), *(stem.with_suffix(ending) for ending in _ENDINGS), stem]
-    return next((path for path in candidates if path.is_file()), None)
+    image = folder / name
+    return next((path for path in (*_candidates(image, ("", *_MARKS)), image) if path.is_file()), None)
+
+
+def _candidates(image: Path, marks: Sequence[str]) -> Iterator[Path]:
+    """Yields the names that an image's mask can have in the folder of the image, with one of the marks."""
+    for mark in marks:
+        for suffix in _SUFFIXES:
+            for ending in (mark + suffix, mark + suffix.upper()):
+                yield image.with_name(image.name + ending)
+                yield image.with_name(image.stem + ending)
+
+
+def image_of_mask(path: Path) -> Path | None:
+    """Returns the image that a file next to it is the mask of, by its name ``NAME_mask.png``; None if there is none."""
+    return image_beside(path, _MARKS)
+
+
+def image_beside(path: Path, marks: Sequence[str]) -> Path | None:
+    """Returns the image ``NAME.*`` that a file ``NAME_mask.png`` belongs to; None if there is none.
+
+    Args:
+        path: the file.
+        marks: what can be between the image's name and the suffix, in lower case.
+    """
+    mark = next((each for each in marks if path.stem.lower().endswith(each)), None)
+    if mark is None:
+        return None
+    image = path.with_name(path.stem[: -len(mark)])
+    if image.suffix.lower() in PHOTO_SUFFIXES and image.is_file():
+        return image
+    return _same_stem(image.with_name(f"{image.name}.x"))
+
+
+@lru_cache(maxsize=256)
+def _marked(folder: Path, changed: int) -> frozenset[str]:
+    """Returns the names of a folder's files that can be masks of others; another ``changed`` invalidates the cache."""
+    with os.scandir(folder) as entries:
+        return frozenset(entry.name for entry in entries if Path(entry.name).stem.lower().endswith(_MARKS))
+
+
+def _next_to(image: Path) -> Path | None:
+    """Finds the mask in an image's folder, ``NAME_mask.png``."""
+    try:
+        known = _marked(image.parent, image.parent.stat().st_mtime_ns)
+    except OSError:
+        return None
+    mask = next((path for path in _candidates(image, _MARKS) if path.name in known), None) if known else None
+    if mask is not None:
+        _check_owner(mask, image.parent, (image.name,), 0)
+    return mask
 
 
 def mask_beside(image: Path) -> Path | None:
-    """Finds the mask of an image in a folder ``masks`` next to it or up to four folders higher.
+    """Finds the mask of an image in a folder ``masks`` next to it or up to four folders higher, or next to the image.
 
     ``A/images/front/1.jpg`` has the mask ``A/masks/front/1.png``. ``A/masks/1.png`` is also taken, unless other folders
     next to ``front`` have an image of that name.
@@ -49,14 +124,15 @@ def mask_beside(image: Path) -> Path | None:
     path = image.absolute()
     for folder in path.parents[:_LEVELS]:
         parts = path.relative_to(folder).parts
-        if not (folder / FOLDER).is_dir():
+        masks = mask_folder(folder)
+        if masks is None:
             continue
         for dropped in range(len(parts) if len(parts) < 3 or is_image_folder(parts[0]) else 1):
-            mask = mask_of(folder / FOLDER, "/".join(parts[dropped:]))
+            mask = mask_of(masks, "/".join(parts[dropped:]))
             if mask is not None:
                 _check_owner(mask, folder, parts, dropped)
                 return mask
-    return None
+    return _next_to(path)
 
 
 def _check_owner(mask: Path, folder: Path, parts: Sequence[str], dropped: int) -> None:
@@ -74,7 +150,7 @@ def _check_owner(mask: Path, folder: Path, parts: Sequence[str], dropped: int) -
         places = [each for each in places if not OTHER_FOLDERS.fullmatch(each.name)]
         other = other or next((found for each in places if (found := _same_stem(each / rest))), None)
     own = folder.joinpath(*parts)
-    if mask.stem != own.name and mask.name != own.name:
+    if not mask.name.startswith(own.name):
         other = other or _same_stem(own, own.suffix)
     if other is not None:
         better = Path(FOLDER, *[part for part in parts[:-1] if not is_image_folder(part)], f"{own.name}.png")
@@ -88,19 +164,23 @@ def _same_stem(image: Path, but: str = "") -> Path | None:
     return next((found for ending in endings if (found := image.with_suffix(ending)).is_file()), None)
 
 
-def find_masks(folder: Path, names: Mapping[int, str], images: Mapping[int, Path], where: str) -> dict[int, Path]:
-    """Finds the masks of images by frame number. If the folder exists, warns about images without a mask.
+def find_masks(
+    folder: Path, names: Mapping[int, str], images: Mapping[int, Path], where: str, known: Mapping[int, Path]
+) -> dict[int, Path]:
+    """Finds the masks of images by frame number. If any has one, warns about images without.
 
     Args:
         folder: folder of masks; need not exist.
         names: image names by frame number, relative to the image folder.
         images: image files by frame number; masks are found from there (:func:`mask_beside`), or else by name.
         where: the scene, for the message.
+        known: masks that a file of the scene names.
 
     Raises:
         AmbiguousMaskError: if a mask may be that of another image of the same name.
     """
-    found = {number: mask_beside(images[number]) or mask_of(folder, name) for number, name in names.items()}
+    folder = mask_folder(folder.parent) or folder
+    found = {i: known.get(i) or mask_beside(images[i]) or mask_of(folder, name) for i, name in names.items()}
     if not folder.is_dir() and not any(found.values()):
         return {}
     lacking = [names[number] for number, path in found.items() if path is None]

@@ -85,10 +85,9 @@ class Nerfstudio(FileSource):
             depth = _named_files(folder, records, "depth_file_path", where) if self.has_depth else {}
             depth = {i: path for i, path in depth.items() if path.is_file()}
             masks = _named_files(folder, records, "mask_path", where)
-        if not masks:
-            counts = Counter(path.name for path in color.values())
-            names = {i: path.name if counts[path.name] == 1 else records[i].file_path for i, path in color.items()}
-            masks = find_masks(folder / MASKS, names, color, f"scene {scene}")
+        counts = Counter(path.name for path in color.values())
+        names = {i: path.name if counts[path.name] == 1 else records[i].file_path for i, path in color.items()}
+        masks = find_masks(folder / MASKS, names, color, f"scene {scene}", masks)
         if not color:
             tried = f"; tried {named[0]} and other endings" if named else ""
             raise DataError(f"scene {scene}: none of the {len(records)} images of {where} exists{tried}")

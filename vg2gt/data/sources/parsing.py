@@ -9,6 +9,7 @@ from __future__ import annotations
 import glob
 import os
 import re
+import unicodedata
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -23,8 +24,7 @@ from vg2gt.io.errors import FormatError
 from vg2gt.io.files import by_number, regular
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".tif", ".tiff", ".webp", ".bmp")
-HEIC_SUFFIXES = (".heic", ".heif")
-PHOTO_SUFFIXES = (*IMAGE_SUFFIXES, *HEIC_SUFFIXES, ".avif", ".jfif", ".jpe")
+PHOTO_SUFFIXES = (*IMAGE_SUFFIXES, ".heic", ".heif", ".avif", ".jfif", ".jpe")
 IMAGE_FOLDERS = ("images", "color", "rgb", "image", "input")
 OTHER_FOLDERS = re.compile(
     r"[._@].*|masks?|depths?|depth[_-].*|.*[_-]depths?|normals?|conf(idence)?|sparse|dense|stereo|semantics?|labels?|"
@@ -139,7 +139,11 @@ def existing_image(path: Path) -> Path | None:
     """
     if path.is_file():
         return path
-    folder = path.parent
+    folder, forms = path.parent, [unicodedata.normalize(form, str(path)) for form in ("NFC", "NFD")]
+    if not path.name.isascii() or not folder.is_dir():  # macOS decomposes umlauts, others do not
+        same = [each for form in forms for each in (folder / Path(form).name, Path(form))]
+        if found := next((each for each in same if each.is_file()), None):
+            return found
     if not folder.is_dir() and folder.name in IMAGE_FOLDERS:  # others, such as cam_1, are cameras of a rig
         reduced = folder.parent.glob(f"{glob.escape(folder.name)}_[0-9]*")
         largest = min(reduced, key=lambda each: by_number(each.name), default=None)

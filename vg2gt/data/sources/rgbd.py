@@ -150,7 +150,7 @@ class RGBDFolder(FileSource):
         if color.suffix.lower() not in IMAGE_SUFFIXES or not color.is_file():  # a part of a video or an archive
             return None
         file = mask_beside(color)
-        mask = None if file is None else read_mask_file(file, index.name)
+        mask = None if file is None else read_mask_file(file, index.name, color)
         return joined_masks([read_mask(color, index.name), mask])
 
     def read_depth(self, index: SceneIndex, row: int, size: Size) -> NDArray[np.float32]:
