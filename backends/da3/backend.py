@@ -139,6 +139,7 @@ class DA3Backend(NetworkBackend):
         net = network_named(name, shape)
 
         def make() -> _DA3Network:
+            """Makes the network, with random weights."""
             network = _DA3Network(
                 Backbone(
                     net.dim, net.depth, net.num_heads, net.ffn, net.multiview_from, net.image_size, net.patch_size

@@ -202,6 +202,7 @@ def map_folder(folder: Path, output: str) -> Iterator[AddView]:
     with whole_folder(folder / kind) as staged:
 
         def add(view: RenderedView) -> None:
+            """Writes the map of one view."""
             name = view_stem(view.camera.name)
             target = staged / f"{name}{suffix}"
             if not target.resolve().is_relative_to(staged.resolve()):

@@ -95,9 +95,19 @@ def contributions(gaussians: Gaussians, cameras: Cameras, renderer: Renderer) ->
 
 
 @torch.no_grad()
-def shown(gaussians: Gaussians, cameras: Cameras, renderer: Renderer) -> Tensor:
-    """Returns ``[G]`` 1 for Gaussians that contribute to a view of ``cameras`` (B = 1), else 0."""
-    return (contributions(gaussians, cameras, renderer) > UNSEEN).to(gaussians.means.dtype)
+def note_seen(parameters: Parameters, views: Tensor, renderer: Renderer) -> None:
+    """Sets ``parameters.seen``: what no trained view shows is spared the penalty on opacity.
+
+    Args:
+        parameters: the scene, which is changed.
+        views: ``[N]`` the views that are trained.
+        renderer: its renderer.
+    """
+    parameters.seen = torch.ones_like(parameters.seen)
+    scene = parameters.present()
+    if len(views) < scene.cameras.world_to_camera.shape[1]:
+        cameras = scene.cameras.select(views.to(parameters.seen.device))
+        parameters.seen *= contributions(scene.gaussians, cameras, renderer) > UNSEEN
 
 
 @torch.no_grad()

@@ -14,7 +14,7 @@ from torch import Tensor
 from vg2gt.losses.gaussian import where_it_counts
 from vg2gt.metrics import psnr
 from vg2gt.refinement.density import fill_holes, supported, with_points
-from vg2gt.refinement.growth import shown
+from vg2gt.refinement.growth import note_seen
 from vg2gt.refinement.options import Observations, Observer, Progress, RefineLoss, RefineOptions
 from vg2gt.refinement.parameters import Parameters, RefinedScene
 from vg2gt.refinement.photographs import Photographs
@@ -208,10 +208,8 @@ class _Refinement:
             filled = fill_holes(begun.gaussians, cameras, seen, renderer, self.trained, options.fill, room)
             begun = replace(begun, gaussians=filled)
         self.parameters = Parameters(begun, options.rates, self.pixel, self.depth, self.trained)
-        if loss.opacity and len(self.trained) < len(views):
-            self.parameters.seen = shown(
-                begun.gaussians, cameras.select(self.trained.to(cameras.intrinsics.device)), renderer
-            )
+        if loss.opacity:
+            note_seen(self.parameters, self.trained, renderer)
 
     def run(self, observe: Observer | None) -> Refined:
         """Runs steps and checks until the refinement ends."""

@@ -14,7 +14,7 @@ from torch import Tensor
 from vg2gt.losses.gaussian import where_it_counts
 from vg2gt.metrics import psnr
 from vg2gt.refinement.exposure import log_exposures
-from vg2gt.refinement.growth import footprints, in_front, remove_idle, shown, split_large
+from vg2gt.refinement.growth import footprints, in_front, note_seen, remove_idle, split_large
 from vg2gt.refinement.options import FullSizeOptions, Observations, Observer, Progress, RefineLoss, RefineOptions
 from vg2gt.refinement.parameters import Parameters, RefinedScene
 from vg2gt.refinement.photographs import Crop, CropOrder, Photographs, whole_views
@@ -131,7 +131,7 @@ class _Sharpening:
         rates = replace(rates, means=self.full.rate * rates.means, sh=self.full.rate * rates.sh)
         self.early = trained[~torch.isin(trained, self.fold)]
         self.parameters = Parameters(start, rates, 1 / focal, self.depth, self.early)
-        self._note_seen(self.early)
+        note_seen(self.parameters, self.early, self.renderer)
         self.limit = _most_steps(self.full, photographs, len(trained), seconds)
         self.open = not len(self.fold)
         self.order = self._order()
@@ -139,15 +139,6 @@ class _Sharpening:
         self.steps = self.growth = self.checked = 0
         self.recent: list[float] = []
         self.scores: list[float] = []
-
-    def _note_seen(self, views: Tensor) -> None:
-        """Spares what none of ``views [N]`` shows the penalty on opacity."""
-        parameters, views = self.parameters, views.to(self.seen.images.device)
-        if len(views) == len(self.seen.images):
-            parameters.seen = torch.ones_like(parameters.seen)
-        else:
-            present = parameters.present()
-            parameters.seen = shown(present.gaussians, present.cameras.select(views), self.renderer)
 
     def run(self, observe: Observer | None) -> Sharpened:
         """Runs steps, growth and checks until the stage ends."""
@@ -240,7 +231,7 @@ class _Sharpening:
         """Trains all views from now on; the exposures of those left out so far start as the scene suggests."""
         self.open = True
         self.order = self._order()
-        self._note_seen(self.views)
+        note_seen(self.parameters, self.views, self.renderer)
         if self.parameters.rates["gain"]:
             scene, fold = self.parameters.scene().detach(), self.fold.to(self.seen.images.device)
             cameras = replace(self.poses, world_to_camera=scene.cameras.world_to_camera).select(fold)
@@ -277,10 +268,10 @@ class _Sharpening:
         if done >= due and self.steps >= self.checked + APART:
             self.scores.append(self._score())
             self.checked = self.steps
-        last = range(1, len(self.scores) + 1)
-        smooth = [sum(self.scores[:n][-SMOOTH:]) / min(n, SMOOTH) for n in last]
-        worse = len(smooth) > SMOOTH and smooth[-1] < max(smooth) - NOTICED
-        if worse and smooth[-1] < smooth[0] - REJECTED and smooth[0] == max(smooth):
+        smooth = [sum(self.scores[:n][-SMOOTH:]) / min(n, SMOOTH) for n in range(1, len(self.scores) + 1)]
+        fall = max(smooth) - smooth[-1] if len(smooth) > SMOOTH else 0.0
+        worse = fall > NOTICED
+        if fall > REJECTED and smooth[0] == max(smooth):
             return "no gain"
         if worse:
             self.stretch = self._raw() / self.full.opened
