@@ -132,11 +132,7 @@ def find_panoramas(files: Sequence[tuple[Path, Size]]) -> dict[Path, Panorama]:
     border to the left one and have poles.
     """
     found = {path: known for path, size in files if (known := _described_panorama(path, size)) is not None}
-    others = [
-        (path, size)
-        for path, size in files
-        if path not in found and size[1] == 2 * size[0] and size[0] >= _LEAST_HEIGHT
-    ]
+    others = [(path, size) for path, size in files if path not in found and may_be_panorama(size)]
     if others and sum(continues(path) for path, _ in others) * 2 > len(others):
         found |= {path: Panorama(size, size) for path, size in others}
     return found
@@ -155,13 +151,12 @@ def continues(path: Path) -> bool:
 
 def show_spheres(frames: Sequence[NDArray[np.uint8]]) -> bool:
     """Returns whether images ``[H, W, 3]`` of a video are panoramas, by the borders of most of them."""
-    if not frames or not _has_shape(frames[0].shape):
-        return False
     small = [Image.fromarray(each).convert("L").resize((_WIDTH, _WIDTH // 2), Image.Resampling.BOX) for each in frames]
     return sum(_continues(np.asarray(each, np.float64)) for each in small) * 2 > len(small)
 
 
-def _has_shape(size: Sequence[int]) -> bool:
+def may_be_panorama(size: Size) -> bool:
+    """Returns whether an image of ``(height, width)`` has the shape of a whole panorama."""
     return size[1] == 2 * size[0] and size[0] >= _LEAST_HEIGHT
 
 

@@ -30,7 +30,7 @@ from vg2gt.data.transforms import from_bytes, to_bytes
 from vg2gt.inputs.damaged import name_left_out, readable
 from vg2gt.inputs.distinct import with_unique_names
 from vg2gt.inputs.folders import image_files
-from vg2gt.inputs.panoramas import FACES, Panorama, find_panoramas, show_spheres, whole_pixels
+from vg2gt.inputs.panoramas import FACES, Panorama, find_panoramas, may_be_panorama, show_spheres, whole_pixels
 from vg2gt.io.errors import some
 from vg2gt.io.image_files import (
     focal_length,
@@ -333,7 +333,7 @@ def _unrolled(frames: list[Picture], path: Path, limit: int | None) -> list[Pict
     def pixels(frame: Picture) -> NDArray[np.uint8]:
         return to_bytes(frame.read(frame.size).images[0]).permute(1, 2, 0).numpy()
 
-    if not frames or frames[0].size[1] != 2 * frames[0].size[0]:
+    if not frames or not may_be_panorama(frames[0].size):
         return frames
     if not show_spheres([pixels(frame) for frame in evenly(frames, _FRAMES_LOOKED_AT)]):
         return frames
