@@ -22,7 +22,9 @@ from vg2gt.geometry.precision import full_precision
 
 PLANES = 64
 _SPACING = 1 / (PLANES - 1)
-_QUARTER, _HALF = (16, 0.25 * _SPACING), (8, 0.1 * _SPACING)  # planes and spacing of the later stages
+ROW = 16  # planes of a row at 1/4, where there are two
+_QUARTER, _HALF = (ROW, 0.25 * _SPACING), (8, 0.1 * _SPACING)  # planes and spacing of the later stages
+_OTHER = 3 * _SPACING  # distance from a centre from which on a plane of the first stage counts as another answer
 _CHANNELS = (16, 16, 8)  # of the regularisation of each stage
 _AGREEMENT = (0.1, 0.05)  # widths of the agreement at 1/8 and 1/4
 _BINS = 16  # channels that hold the summed probability of the planes
@@ -74,10 +76,13 @@ class CascadeNet(nn.Module):
         self.end = nn.Conv2d(48, 1 + 36, 3, 1, 1)
         self.embed_fine = nn.Sequential(nn.Linear(4 * 6 + 16 * 2, 2 * DIM), nn.GELU(), nn.Linear(2 * DIM, DIM))
         self.head = DepthHead(4)
+        self.other = nn.Linear(3, 1)  # logit of the other answer at 1/4, from the probabilities of both and the share
         self.gate = nn.Parameter(torch.tensor([-3.0, 4.0, 8.0]))  # bias, mass, mass times greatest agreement
         for layer in (self.fill, self.end, self.embed_fine[2]):
             nn.init.zeros_(layer.weight)  # pyright: ignore[reportArgumentType]
             nn.init.zeros_(layer.bias)  # pyright: ignore[reportArgumentType]
+        nn.init.zeros_(self.other.weight)
+        nn.init.constant_(self.other.bias, -1.0)
 
     def encode(
         self, features: CascadeFeatures, views: PosedViews, sources: Tensor, shown: Tensor | None = None
@@ -129,7 +134,7 @@ class CascadeNet(nn.Module):
         visible = visible.detach().gather(1, chosen[:, :, None, None].expand(-1, -1, *visible.shape[2:]))
         quarter = convex_upsample(center, mask)
         warp = views.warp(features.match[1], best, 4)
-        second, visible = self._narrow(1, quarter, _QUARTER, features, planes, warp, visible)
+        second, visible = self._quarter(quarter, first, share, features, planes, warp, visible)
         log_depth = -planes.inverse(second.t).log()
         agreeing = agreement((-log_depth).exp().detach(), warp, _AGREEMENT[1])
         known = torch.cat((log_depth - scale, second.mass, agreeing, log_depth - quarter), 1)
@@ -155,6 +160,38 @@ class CascadeNet(nn.Module):
             guess,
             centers,
         )
+
+    def _quarter(
+        self,
+        center: Tensor,
+        first: Sweep,
+        share: Tensor,
+        features: CascadeFeatures,
+        planes: Planes,
+        warp: SourceWarp,
+        visible: Tensor,
+    ) -> tuple[Sweep, Tensor]:
+        """The stage at 1/4, around the log-depth ``center`` and around the likeliest plane that is not near it.
+
+        At 1/8 a thin object shares its cell with what is behind it, and a wrong guess may replace a right match.
+        ``share`` is that of the matched depth in ``center``, ``[V, 1, h / 2, w / 2]``.
+        """
+        likely = F.interpolate(first.logits.detach().softmax(1), size=center.shape[-2:], mode="nearest")
+        near = (first.position - planes.position(center.detach())).abs() <= _OTHER  # [V, PLANES, h, w]
+        best, index = likely.masked_fill(near, 0).max(1, keepdim=True)
+        other = -planes.inverse(index / (PLANES - 1)).log()
+        share = F.interpolate(share.detach(), size=center.shape[-2:], mode="nearest")
+        known = torch.cat((best, (likely * near).sum(1, keepdim=True), share), 1)
+        bias = self.other(known.movedim(1, -1)).movedim(-1, 1)  # [V, 1, h, w]
+        one, kept = self._narrow(1, center, _QUARTER, features, planes, warp, visible)
+        two, _ = self._narrow(1, other, _QUARTER, features, planes, warp, visible)
+        logits = torch.cat((one.logits, two.logits + bias), 1)
+        # the depth is that of the bracket with the likelier peak, so that the two are never averaged
+        second = two.logits.amax(1, keepdim=True) + bias > one.logits.amax(1, keepdim=True)
+        shares = logits.unflatten(1, (2, -1)).logsumexp(2).softmax(1)  # [V, 2, h, w]
+        mass = torch.where(second, two.mass * shares[:, 1:], one.mass * shares[:, :1])
+        position = torch.cat((one.position, two.position), 1)
+        return Sweep(logits, position, torch.where(second, two.t, one.t), mass), kept
 
     def _narrow(
         self,

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from backends.cascade.network import PLANES, CascadeEncoding
+from backends.cascade.network import PLANES, ROW, CascadeEncoding
 from backends.cascade.planes import Planes, baselines
 from backends.sweep.network import Sweep
 from recipes.cascade.samples import Sample
@@ -60,7 +60,7 @@ def objective(
         weight = seen * F.avg_pool2d(sample.weight[:, None], cell)
         truth = inverse.clamp_min(1e-9).reciprocal()
         found = -planes.inverse(stage.t).log()
-        sums["planes"].append(_cross_entropy(stage, planes.position(truth.log()), seen))
+        sums["planes"].append(plane_entropy(stage, planes.position(truth.log()), seen))
         looked = {"stages": found, "centers": center} | ({"guess": encoding.guess} if cell == 8 else {})
         for name, log_depth in looked.items():
             off = _limited(_log_error(log_depth, truth, farthest)[0])
@@ -94,14 +94,20 @@ def _gradient(error: Tensor, valid: Tensor) -> Tensor:
     return down.mean() + right.mean()
 
 
-def _cross_entropy(stage: Sweep, t: Tensor, known: Tensor) -> Tensor:
-    """Cross-entropy of the planes; the target ``t [V, 1, h, w]`` is split linearly between its two nearest planes."""
-    count = stage.position.shape[1]
-    spacing = stage.position[:, -1:] - stage.position[:, -2:-1]
-    place = count - 1 - (stage.position[:, -1:] - t) / spacing
-    known = known * (place >= 0) * (place <= count - 1)
-    low = place.floor().clamp(0, count - 2)
-    share = (place - low).clamp(0, 1)
-    likely, low = F.log_softmax(stage.logits, 1), low.long()
-    entropy = -(likely.gather(1, low) * (1 - share) + likely.gather(1, low + 1) * share)
-    return _mean(entropy, known)
+def plane_entropy(stage: Sweep, t: Tensor, known: Tensor) -> Tensor:
+    """Cross-entropy of the planes; the target ``t [V, 1, h, w]`` is split linearly between its two nearest planes.
+
+    Where a stage has two rows of planes, the target is in the first one that holds it.
+    """
+    entropy, every = torch.zeros_like(t), torch.zeros_like(t)
+    rows = 2 if stage.position.shape[1] == 2 * ROW else 1
+    likely = F.log_softmax(stage.logits, 1)
+    for position, row in zip(stage.position.chunk(rows, 1), likely.chunk(rows, 1), strict=True):
+        count = position.shape[1]
+        place = count - 1 - (position[:, -1:] - t) / (position[:, -1:] - position[:, -2:-1])
+        held = known * (place >= 0) * (place <= count - 1) * (1 - every)
+        low = place.floor().clamp(0, count - 2)
+        share, low = (place - low).clamp(0, 1), low.long()
+        entropy = entropy - held * (row.gather(1, low) * (1 - share) + row.gather(1, low + 1) * share)
+        every = every + held
+    return entropy.sum() / every.sum().clamp_min(1)

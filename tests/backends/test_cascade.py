@@ -5,9 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from backends.cascade import CascadeBackend
-from backends.cascade.network import PLANES, CascadeEncoding, CascadeNet
+from backends.cascade.network import PLANES, ROW, CascadeEncoding, CascadeNet
 from backends.cascade.planes import FARTHEST, Planes, baselines, coarse_sources, fine_sources
 from backends.cascade.sweep import Matching
 from backends.sweep.correlate import SourceWarp
@@ -100,7 +101,7 @@ def test_shapes_and_gradients(make_scene, network: CascadeNet) -> None:
         encoding.taps, encoding.context, encoding.context_fine, encoding.swept, encoding.origin
     )
     assert depth.shape == log_scale.shape == (2, *SIZE)
-    assert [stage.logits.shape[1:] for stage in encoding.stages] == [(64, 4, 6), (16, 8, 12), (8, 16, 24)]
+    assert [stage.logits.shape[1:] for stage in encoding.stages] == [(64, 4, 6), (32, 8, 12), (8, 16, 24)]
     parts = [depth.log(), log_scale, encoding.guess, *encoding.centers, *(stage.t for stage in encoding.stages)]
     torch.stack([part.square().mean() for part in parts]).sum().backward()
     for name, parameter in network.named_parameters():
@@ -171,3 +172,21 @@ def test_depth_is_in_the_unit_of_the_cameras_and_needs_no_range(make_scene) -> N
 def test_weights_must_be_named() -> None:
     with pytest.raises(FileNotFoundError, match=r"no published weights: give backend\.path=FILE"):
         CascadeBackend()
+
+
+def test_a_second_answer_is_searched_at_a_quarter(make_scene, network: CascadeNet) -> None:
+    """The second row of planes lies around the likeliest plane of the first stage that the first row leaves out."""
+    with torch.no_grad():
+        encoding = encode(network, posed(make_scene, 3))
+    first, second, _ = encoding.stages
+    spacing = 1 / (PLANES - 1)
+    # centres of the rows, from their last planes: the first ones may be cut at infinity
+    rows = second.position.unflatten(1, (2, ROW))[:, :, -1] - (ROW - 1) / 2 * 0.25 * spacing  # [V, 2, h, w]
+    assert ((rows[:, 1] - rows[:, 0]).abs() > 2 * spacing).all()
+    likely = F.interpolate(first.logits.softmax(1), size=rows.shape[-2:], mode="nearest")
+    left = likely.masked_fill((first.position - rows[:, :1]).abs() <= 3 * spacing, 0)
+    torch.testing.assert_close(
+        rows[:, 1], (left.argmax(1) * spacing).clamp_min(0.1 * spacing), rtol=0, atol=0.05 * spacing
+    )
+    inside = (second.t - rows).abs().amin(1) <= ROW / 8 * spacing  # the depth is in one of the rows, not between them
+    assert inside.all()
