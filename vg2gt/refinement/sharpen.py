@@ -110,7 +110,8 @@ class _Sharpening:
         clock: Callable[[], float],
     ) -> None:
         assert options.full is not None
-        self.options, self.full, self.loss = options, options.full, options.loss
+        self.options, self.full = options, options.full
+        self.loss = replace(options.loss, ssim=options.full.ssim * options.loss.ssim)
         large = max(photographs.size) >= LARGE * max(start.cameras.size)
         self.whole, self.seen = photographs, seen
         self.photographs = photographs.halved() if large and self.full.coarse else photographs
