@@ -15,6 +15,7 @@ from vg2gt.evaluation.run import evaluate
 from vg2gt.evaluation.scene_metrics import ause, stated_error_metrics
 from vg2gt.runs.load import load_model
 from vg2gt.training.loop import train
+from vg2gt.visibility import Status
 
 
 def overrides(cache: Path, *more: str) -> list[str]:
@@ -49,7 +50,8 @@ def test_an_evaluation_scores_it(calibrated: Path, cache: Path, tmp_path: Path) 
     held = [mean[f"stated/held_{level}"] for level in (50, 80, 90, 95)]
     assert held == sorted(held)
     assert held[2] == pytest.approx(0.9, abs=0.08)  # two rooms of 28x56
-    assert 0 < mean["stated/width_50"] < mean["stated/width_95"] <= 1
+    assert 0 < mean["stated/width_50"] < mean["stated/width_95"]
+    assert 0 < mean["stated/held_90_agreed"] <= 1
     assert "## Stated errors of the decoded depth" in (tmp_path / "metrics.md").read_text()
 
 
@@ -64,10 +66,15 @@ def test_it_needs_a_place_and_enough_scenes(cache: Path) -> None:
 def test_coverage_width_and_order() -> None:
     error = torch.tensor([0.01, 0.02, 0.03, 0.04])
     bounds = torch.tensor([[0.02] * 4, [0.02] * 4, [0.02, 0.01, 0.05, 0.05], [0.05] * 4])
-    found = stated_error_metrics(error, bounds)
+    status = torch.tensor([Status.AGREED, Status.AGREED, Status.SINGLE, Status.AGREED])
+    found = stated_error_metrics(error, bounds, status)
     assert (found["held_50"], found["held_90"]) == (0.5, 0.75)
+    assert (found["held_90_agreed"], found["held_90_single"]) == (pytest.approx(2 / 3), 1)
+    assert math.isnan(found["held_90_contradicted"])
     assert found["width_90"] == pytest.approx(0.0325)
-    assert math.isnan(stated_error_metrics(torch.zeros(0), torch.zeros(4, 0))["ause"])  # nothing to score
+    assert math.isnan(
+        stated_error_metrics(torch.zeros(0), torch.zeros(4, 0), torch.zeros(0))["ause"]
+    )  # nothing to score
     error = torch.rand(1000, generator=torch.Generator().manual_seed(0))
     assert ause(error, 3 * error) == pytest.approx(0, abs=1e-9)
     shuffled = ause(error, torch.rand(1000, generator=torch.Generator().manual_seed(1)))

@@ -119,13 +119,13 @@ def test_what_is_not_trusted_is_left_out(stated: Scene) -> None:
 
 
 def test_impossible_wishes_are_refused(stated: Scene, scene: Scene) -> None:
-    windowed = replace(stated, support=None, error=None)
+    unknown = replace(stated, support=None, error=None)
     for of, wish, said in (
         (stated, {"min_confidence": 2}, "--min-confidence 2"),
         (scene, {"min_confidence": 0.9}, "vg2gt calibrate"),
         (stated, {"min_confidence": 1}, "no Gaussian is left"),
-        (windowed, {"min_confidence": 0.9}, "made in windows"),
-        (windowed, {"drop": ["guessed"]}, "made in windows"),
+        (unknown, {"min_confidence": 0.9}, "reconstruct it again"),
+        (unknown, {"drop": ["guessed"]}, "reconstruct it again"),
     ):
         with pytest.raises(ValueError, match=said):
             trusted(of, **wish)

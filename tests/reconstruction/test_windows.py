@@ -19,6 +19,7 @@ from vg2gt.geometry.alignment import align_cameras
 from vg2gt.inputs.given_cameras import given_pictures
 from vg2gt.metrics import psnr
 from vg2gt.reconstruction.pipeline import reconstruct_with
+from vg2gt.reconstruction.trust import trusted
 from vg2gt.reconstruction.windows import run as windows_run
 from vg2gt.reconstruction.windows import store
 from vg2gt.reconstruction.windows.store import cut, merge_windows, window_size
@@ -73,6 +74,21 @@ def test_windows_give_the_gaussians_of_all_views_at_once(model, walk, whole, mon
     calls = model.backend._calls
     close(reconstruct_with(model, walk, window=8), whole)
     assert model.backend._calls == calls + 2 * len(cut(VIEWS, 8))
+
+
+def test_windows_know_what_views_confirm(model, walk, whole) -> None:
+    """One window of all views knows it exactly; smaller ones compare each view with fewer others."""
+    calibration = load_model(device="cpu").calibration
+    known = reconstruct_with(model, walk, window=0, calibration=calibration)
+    one = reconstruct_with(model, walk, window=VIEWS, calibration=calibration)
+    assert known.error is not None
+    assert one.error is not None
+    assert torch.equal(one.support, known.support)
+    assert_close(one.error, known.error, atol=1e-5, rtol=1e-3)
+    some = reconstruct_with(model, walk, window=6)
+    assert some.error is None
+    assert (some.support == known.support).float().mean() > 0.9
+    assert len(trusted(some, drop=["single", "contradicted"]).gaussians) < len(some.gaussians)
 
 
 def test_surfels_look_as_those_of_all_views_at_once(walk) -> None:

@@ -1,6 +1,7 @@
 """Bounds hold as often as they say, whatever the backbone's confidence is worth."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,7 @@ import torch
 from vg2gt.evaluation.scene_metrics import ause
 from vg2gt.io.errors import FormatError
 from vg2gt.uncertainty import LEVELS, Calibration, Samples, calibrate, read_calibration
-from vg2gt.uncertainty.calibration import MEASURED
+from vg2gt.uncertainty.calibration import MEASURED, increasing_quantiles
 from vg2gt.visibility import Status
 from vg2gt.visibility.evidence import EVIDENCE
 
@@ -61,8 +62,28 @@ def test_what_has_no_depth_is_unknown(made: Calibration) -> None:
     status = torch.tensor([[Status.GUESSED, Status.UNSEEN, Status.AGREED]])
     error = made.error(torch.zeros(1, 3, len(EVIDENCE)), status)
     assert error.shape == (1, 3)
-    assert error[0, :2].tolist() == [1.0, 1.0]
+    assert error[0, :2].isinf().all()
     assert error[0, 2] < 1
+
+
+def test_bounds_hold_for_errors_with_heavy_tails() -> None:
+    """A quarter of the errors exceeds 1, and the 95 % bound has to be far above it."""
+
+    def heavy(seed: int) -> Samples:
+        samples = pixels(seed)
+        uniform = torch.rand(len(samples.error), generator=torch.Generator().manual_seed(seed)).double()
+        return replace(samples, error=(0.25 / (1 - uniform)).float())  # Pareto: P(error > x) = 0.25 / x
+
+    made, fresh = calibrate(heavy(0), "weights"), heavy(1)
+    bounds = made.bounds(fresh.evidence, fresh.status)
+    for level, bound in zip(LEVELS, bounds, strict=True):
+        assert float((fresh.error <= bound).float().mean()) == pytest.approx(level, abs=0.01)
+
+
+def test_bins_in_the_wrong_order_are_pooled() -> None:
+    bins = [torch.full((9,), value) for value in (0.1, 0.4, 0.2, 0.3, 0.5)]
+    assert increasing_quantiles(bins, 0.9).tolist() == pytest.approx([0.1, 0.4, 0.4, 0.4, 0.5])
+    assert increasing_quantiles(bins, 0.5).tolist() == pytest.approx([0.1, 0.3, 0.3, 0.3, 0.5])
 
 
 def test_it_is_the_same_from_a_file(made: Calibration, tmp_path: Path) -> None:

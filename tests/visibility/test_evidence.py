@@ -1,5 +1,7 @@
 """What two cameras in front of a wall know of it."""
 
+import math
+
 import pytest
 import torch
 
@@ -96,5 +98,6 @@ def test_the_status_of_points(cameras: Cameras) -> None:
     status, bound = point_support(points, depth, cameras, error)
     expected = ["AGREED", "SINGLE", "CONTRADICTED", "UNSEEN", "GUESSED", "UNSEEN", "AGREED"]
     assert [Status(int(kind)).name for kind in status] == expected
-    torch.testing.assert_close(bound, torch.tensor([0.01, 0.02, 1, 1, 1, 1, 0.02]), atol=1e-4, rtol=1e-4)
+    expected = [0.01, 0.02, *4 * [math.inf], 1.01 * 1.01 - 1]
+    torch.testing.assert_close(bound, torch.tensor(expected), atol=1e-4, rtol=1e-4)
     assert point_support(points, depth, cameras)[1][0] == pytest.approx(0, abs=1e-5)

@@ -184,7 +184,7 @@ class SceneEvaluator:
             predicts = self.model.backend.predicts_cameras
             pixels = pixels_with_errors(prediction, prediction.supported, known.context, predicts)
             bounds = self.calibration.bounds(pixels.evidence, pixels.status)
-            metrics |= _under("stated", stated_error_metrics(pixels.error, bounds))
+            metrics |= _under("stated", stated_error_metrics(pixels.error, bounds, pixels.status))
         metrics |= self._pose_and_point_cloud_metrics(known.context, prediction, renders["context"])
         cost["cv"] = cv(prediction.gaussians.means, self.options.neighbors, CV_QUERIES)
         return metrics | _under("scene", cost), renders

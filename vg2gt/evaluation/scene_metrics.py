@@ -18,7 +18,7 @@ from vg2gt.metrics import (
     ssim,
 )
 from vg2gt.types import Batch, Cameras, Decoded, Geometry, Render
-from vg2gt.uncertainty import LEVELS, Samples
+from vg2gt.uncertainty import LEVELS, MEASURED, STATED, Samples
 from vg2gt.visibility import pixel_evidence
 
 SHARES = 20  # steps of the sparsification curve
@@ -95,22 +95,27 @@ def align_geometry(geometry: Geometry, truth: Batch) -> Similarity | None:
     return align_points(predicted[valid][None], reference[valid][None])
 
 
-def stated_error_metrics(error: Tensor, bounds: Tensor) -> dict[str, float]:
-    """Scores stated bounds on relative errors: how often they hold, how wide they are, and how well they rank errors.
+def stated_error_metrics(error: Tensor, bounds: Tensor, status: Tensor) -> dict[str, float]:
+    """Scores stated bounds of errors: how often they hold, how wide they are, and how well they rank errors.
 
     Args:
-        error: ``[N]`` relative errors >= 0.
+        error: ``[N]`` errors >= 0 (:mod:`vg2gt.uncertainty.calibration`).
         bounds: ``[L, N]`` stated upper bounds of the errors, for each of :data:`vg2gt.uncertainty.LEVELS`.
+        status: ``[N]`` :class:`vg2gt.visibility.Status` of the pixels.
 
     Returns:
-        For each level, ``held_90``, the share of errors within the bound, and ``width_90``, the mean bound; and
-        ``ause``, :func:`ause` of the last level's bound. NaN without pixels.
+        For each level, ``held_90``, the share of errors within the bound, and ``width_90``, the mean bound;
+        ``held_90_agreed`` and so on, the share for the pixels of each status with a depth, at the level of the stated
+        error; and ``ause``, :func:`ause` of the last level's bound. NaN without pixels.
     """
     scores: dict[str, float] = {}
     for level, bound in zip(LEVELS, bounds, strict=True):
-        name = f"{100 * level:.0f}"
-        scores[f"held_{name}"] = float((error <= bound).double().mean())
+        name, held = f"{100 * level:.0f}", (error <= bound).double()
+        scores[f"held_{name}"] = float(held.mean())
         scores[f"width_{name}"] = float(bound.double().mean())
+        if level == STATED:
+            for kind in MEASURED:
+                scores[f"held_{name}_{kind.name.lower()}"] = float(held[status == kind].mean())
     return scores | {"ause": ause(error, bounds[-1])}
 
 
@@ -154,5 +159,5 @@ def pixels_with_errors(
     rows = (depth > 0) & (true > 0) & true.isfinite()
     ratio = true[rows] / depth[rows]
     ratio = ratio / ratio.median() if predicts_cameras and len(ratio) else ratio * decoded.unit[0]
-    error = (ratio - 1).abs()
+    error = ratio.log().abs().expm1()
     return Samples(evidence[rows], status[rows], error, torch.full_like(error, scene, dtype=torch.int64)).to("cpu")

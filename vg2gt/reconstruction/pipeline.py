@@ -69,11 +69,11 @@ def reconstruct_with(
             (:mod:`vg2gt.reconstruction.windows`); 0: all at once; None: 24 if there are more than 100, else all.
         window_folder: folder for finished windows, from which an interrupted reconstruction resumes; None: a temporary
             one.
-        calibration: calibration of the model, from which errors are stated; None, or in windows: no stated errors.
+        calibration: calibration of the model, from which errors are stated; None: no stated errors.
 
     Returns:
         The scene in the frame of given cameras, else upright; its Gaussians stay on the model's device. For a scene
-        made in windows, images and depth are memory-mapped.
+        made in windows, images, depth and stated errors are memory-mapped.
 
     Raises:
         FileNotFoundError: if a path does not exist.
@@ -93,7 +93,9 @@ def reconstruct_with(
             with TemporaryDirectory(prefix="vg2gt-windows-", ignore_cleanup_errors=True) as temporary:
                 place = Path(window_folder or temporary)
                 run = WindowRun(window_model(model.eval()), pictures, target, images_at_a_time, place, monitor)
-                parts = _Parts(*run.geometry_and_gaussians(), run.capture.images, run.capture.mask)
+                geometry, gaussians, unit = run.geometry_and_gaussians()
+                error, support = run.trust(geometry, calibration)
+                parts = _Parts(geometry, gaussians, unit, run.capture.images, run.capture.mask, error, support)
         else:
             parts = _at_once(model.eval(), load_views(pictures, target, monitor), monitor, calibration)
     scene = _scene(parts, pictures, renderer or Renderer(), model.backend.is_metric)

@@ -85,7 +85,8 @@ class Scene:
         frame: placement of the world in that of the given or found cameras; None if unknown.
         mask: ``[V, H, W]`` in [0, 1], weights of the input pixels; None: all count.
         pictures: source pictures, one per view; empty for a scene read from files.
-        error: ``[V, H, W]`` relative error that the decoded depth stays below in 9 of 10 pixels; None: not stated.
+        error: ``[V, H, W]`` bound e that holds in 9 of 10 pixels: decoded and true depth differ by a factor of at most
+            1 + e; infinite without a measured depth. None: not stated.
         support: ``[V, H, W]`` uint8 :class:`vg2gt.visibility.Status` of each pixel; None: unknown.
         poses: ``[V, 4, 4]`` float64 ``world_to_camera``, if known more precisely than in ``cameras``.
     """
@@ -116,7 +117,7 @@ class Scene:
     def gaussian_trust(self) -> dict[str, Tensor] | None:
         """``support`` (:class:`vg2gt.visibility.Status`) and, if stated, ``error`` of the Gaussians, ``[G]`` each.
 
-        None if the support of the pixels is unknown, as for scenes made in windows.
+        None if the support of the pixels is unknown.
         """
         if self.support is None:
             return None

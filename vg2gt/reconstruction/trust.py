@@ -71,8 +71,7 @@ def trusted(scene: Scene, min_confidence: float | None = None, drop: Sequence[st
         return scene
     known = scene.gaussian_trust
     if known is None or scene.support is None:
-        raise ValueError("--drop and --min-confidence need the support of a scene, unknown if made in windows: omit "
-            "them, or process all images at once (--window 0)")  # fmt: skip
+        raise ValueError("--drop and --min-confidence need a scene with support: reconstruct it again")
     if min_confidence is not None and scene.error is None:
         raise ValueError("--min-confidence needs a calibration of the model: run vg2gt calibrate, or use --drop")
     unwanted = torch.tensor([NAMES[name] for name in drop])
@@ -121,7 +120,7 @@ def trust_lines(scene: Scene) -> list[str]:
     """Returns sentences for a terminal: which part of a scene is confirmed, its depth errors, and what may help."""
     figures = trust_figures(scene).get("trust")
     if figures is None:
-        return ["how many views confirm a Gaussian is not known for scenes made in windows"]
+        return ["how many views confirm a Gaussian is not known for this scene"]
     shares = figures["gaussians"]
     rest = [f"{100 * shares[name]:.0f} % {said}" for name, said in _DOUBTS.items() if shares[name] >= 0.005]
     lines = [f"Gaussians: {100 * shares['agreed']:.0f} % are confirmed by two or more views"]

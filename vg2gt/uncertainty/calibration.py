@@ -1,4 +1,7 @@
-"""Calibrated bounds of the relative depth error from evidence (split conformal prediction).
+"""Calibrated bounds of the depth error from evidence (split conformal prediction).
+
+An error e says that the true depth and the decoded one differ by a factor of 1 + e, whichever is larger. Neither it nor
+its bounds have an upper limit: relative to one of the two depths, errors in one direction could not exceed 1.
 
 Pixels are grouped by status, and the calibration scenes are split in two halves. The first half ranks the pixels of a
 group: a sum of piecewise linear functions of the evidence is fitted to the logarithm of the error. The second half
@@ -28,7 +31,7 @@ from vg2gt.visibility.evidence import EVIDENCE, Status
 
 LEVELS = (0.5, 0.8, 0.9, 0.95)
 STATED = 0.9  # level of the bound called ``error``
-UNKNOWN = 1.0  # bound where nothing is known, and largest stated bound
+UNKNOWN = math.inf  # bound where no depth is measured
 MEASURED = (Status.CONTRADICTED, Status.SINGLE, Status.AGREED)  # statuses with a depth
 KNOTS, BINS = 8, 24
 SCENE_KNOTS = 2  # for evidence shared by a whole scene, which has few distinct values
@@ -45,7 +48,7 @@ class Samples(TensorRecord):
     Attributes:
         evidence: ``[N, F]`` of :data:`vg2gt.visibility.evidence.EVIDENCE`.
         status: ``[N]``, see :class:`vg2gt.visibility.evidence.Status`.
-        error: ``[N]`` error relative to the decoded depth.
+        error: ``[N]`` error of the decoded depth, see the module docstring.
         scene: ``[N]`` int64 scene index of each pixel.
     """
 
@@ -72,7 +75,7 @@ class Curve:
         knots: increasing positions, for each kind of evidence.
         values: contribution to the logarithm of the error at each knot.
         scores: ``[K]`` increasing sums of contributions.
-        bounds: ``[L, K]`` bounds of the relative error at these scores, for each of :data:`LEVELS`.
+        bounds: ``[L, K]`` bounds of the error at these scores, for each of :data:`LEVELS`.
     """
 
     knots: tuple[Tensor, ...]
@@ -93,7 +96,7 @@ class Curve:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Bounds of the relative depth error for one model.
+    """Bounds of the depth error for one model.
 
     Attributes:
         curves: by status.
@@ -106,12 +109,12 @@ class Calibration:
     scenes: int
 
     def bounds(self, evidence: Tensor, status: Tensor) -> Tensor:
-        """Returns bounds ``[L, ...]`` at :data:`LEVELS` for evidence ``[..., F]``; 1 where no depth is measured."""
+        """Returns bounds ``[L, ...]`` at :data:`LEVELS` for evidence ``[..., F]``; infinite without a depth."""
         flat, statuses = evidence.flatten(0, -2), status.flatten()
         found = torch.full((len(LEVELS), len(flat)), UNKNOWN, device=evidence.device)
         for kind, curve in self.curves.items():
             rows = (statuses == kind).nonzero()[:, 0]
-            found[:, rows] = curve(flat[rows]).clamp(max=UNKNOWN)
+            found[:, rows] = curve(flat[rows])
         return found.unflatten(1, status.shape)
 
     def error(self, evidence: Tensor, status: Tensor) -> Tensor:
@@ -201,14 +204,10 @@ def _fit(order: Samples, meaning: Samples) -> Curve:
     values = solved.split([len(k) for k in knots])
     curve = Curve(tuple(k.float() for k in knots), tuple(v.float() for v in values), torch.zeros(1), torch.ones(1, 1))
     score = curve.score(meaning.evidence)
-    by_score = score.argsort(stable=True)
-    scores, bounds = [], []
-    for rows in by_score.tensor_split(BINS):
-        error = meaning.error[rows].clamp(min=SMALLEST).sort().values
-        ranks = [min(math.ceil((len(rows) + 1) * level), len(rows)) - 1 for level in LEVELS]
-        scores.append(score[rows].mean())
-        bounds.append(error[ranks])
-    return Curve(curve.knots, curve.values, torch.stack(scores), _increasing(torch.stack(bounds, 1)))
+    bins = score.argsort(stable=True).tensor_split(BINS)
+    errors = [meaning.error[rows].clamp(min=SMALLEST) for rows in bins]
+    bounds = torch.stack([increasing_quantiles(errors, level) for level in LEVELS])
+    return Curve(curve.knots, curve.values, torch.stack([score[rows].mean() for rows in bins]), bounds)
 
 
 def _knots(column: Tensor, name: str) -> Tensor:
@@ -217,9 +216,26 @@ def _knots(column: Tensor, name: str) -> Tensor:
     return torch.from_numpy(np.quantile(column.double().numpy(), steps)).unique()
 
 
-def _increasing(values: Tensor) -> Tensor:
-    """Makes noisy ``values [L, K]`` increase along K: mean of the tightest increasing bounds from above and below."""
-    return (values.cummax(1).values + values.flip(1).cummin(1).values.flip(1)) / 2
+def increasing_quantiles(errors: Sequence[Tensor], level: float) -> Tensor:
+    """Returns bounds ``[K]`` that increase and hold for a share ``level`` of the errors of K bins.
+
+    Bins in the wrong order are pooled, and the bound of a pool is the quantile of all its errors (isotonic regression
+    by pooling adjacent violators). So it holds as often as it says for every pool; a mean of bounds would not.
+    """
+    pools: list[tuple[Tensor, int, float]] = []  # errors, number of bins, bound
+    for own in errors:
+        pool = (own, 1, _quantile(own, level))
+        while pools and pools[-1][2] > pool[2]:
+            before = pools.pop()
+            joined = torch.cat((before[0], pool[0]))
+            pool = (joined, before[1] + pool[1], _quantile(joined, level))
+        pools.append(pool)
+    return torch.tensor([bound for _, bins, bound in pools for _ in range(bins)])
+
+
+def _quantile(errors: Tensor, level: float) -> float:
+    """Returns the error that a further one stays below with a probability of ``level`` or more."""
+    return float(errors.kthvalue(min(math.ceil((len(errors) + 1) * level), len(errors))).values)
 
 
 def _hats(column: Tensor, knots: Tensor) -> Tensor:

@@ -94,16 +94,15 @@ def point_support(
         points: ``[N, 3]`` in the world frame of the cameras.
         depth: ``[V, H, W]`` z-depth that the scene is made of, 0 = none.
         cameras: cameras of the views (B = 1).
-        error: ``[V, H, W]`` bound of the relative error of the depth; None: it is exact.
+        error: ``[V, H, W]`` bound e of the depth's error: it is off by a factor of at most 1 + e; None: it is exact.
 
     Returns:
-        :class:`Status` as ``[N]`` uint8, and a bound ``[N]`` of the relative error of a point's depth: the pixel's
-        bound plus the relative distance of the point to the pixel's depth, minimised over the views that agree; 1
-        where no view agrees.
+        :class:`Status` as ``[N]`` uint8, and such a bound ``[N]`` for a point's depth: the pixel's factor times the one
+        between point and pixel, minimised over the views that agree; infinite where no view agrees.
     """
     count, height, width = len(points), *depth.shape[1:]
     agree, through, blank = (torch.zeros(count, device=points.device) for _ in range(3))
-    bound = torch.ones(count, device=points.device)
+    bound = torch.full((count,), torch.inf, device=points.device)
     for view in range(len(depth)):
         pixels, z = project(points[None, None], cameras.select(slice(view, view + 1)))
         column, row = pixels[0, 0].nan_to_num(-1.0, -1.0, -1.0).round().unbind(-1)
@@ -116,7 +115,8 @@ def point_support(
         agree += agrees
         through += known & (ratio < 1 - POINT_MARGIN)
         blank += inside & (found <= 0)
-        own = (ratio - 1).abs() + (0.0 if error is None else error[view].flatten()[index])
+        own = torch.maximum(ratio, 1 / ratio.clamp(min=1e-12)) - 1  # of the point to the pixel
+        own = own if error is None else own + (1 + own) * error[view].flatten()[index]
         bound = torch.where(agrees, torch.minimum(bound, own), bound)
     status = torch.full_like(bound, Status.UNSEEN)
     status[blank > 0] = Status.GUESSED

@@ -27,6 +27,8 @@ from vg2gt.reconstruction.windows.placement import (
 )
 from vg2gt.reconstruction.windows.store import Capture, Window, WindowStore, cut, merge_windows, remove, set_key
 from vg2gt.types import Cameras, Gaussians, Geometry, Tokens
+from vg2gt.uncertainty import Calibration
+from vg2gt.visibility import Status, pixel_evidence
 from vg2gt.visibility.check import choose_partners
 
 TOKEN_BYTES = 4e9  # maximum size of all windows' tokens on disk; if larger, the backbone runs a second time instead
@@ -81,6 +83,7 @@ class WindowRun:
         shape = (self.count, *size)
         self.raw, self.conf = (self.store.array(name, shape) for name in ("raw_depth", "depth_conf"))
         self.depth = self.store.array("depth", shape)
+        self.units = torch.ones(self.count)  # of the scene in those of each view's window
 
     def geometry_and_gaussians(self) -> tuple[Geometry, Gaussians, Tensor]:
         """Returns the geometry of all views, with depth only where the scene uses it, the Gaussians, and the unit."""
@@ -96,12 +99,46 @@ class WindowRun:
         unit = self.model.scale(_sampled(geometry), None)
         for rows in self.blocks:
             self.depth[rows] *= unit
+        self.units = scales * unit.cpu()
         geometry = replace(geometry, cameras=scale_translations(geometry.cameras, unit), scale=geometry.scale / unit)
         # visibility check, fine voxels of each window, Gaussians of all windows
         size = self._check(geometry)
         gaussians = self._finish(self._pool(geometry, size), size)
         remove(self.store.folder.parent, but=self.store.folder)
         return replace(geometry, cameras=geometry.cameras.to(self.device)), gaussians, unit
+
+    def trust(self, geometry: Geometry, calibration: Calibration | None) -> tuple[Tensor | None, Tensor]:
+        """Returns stated error and status of all pixels, each compared with the other views of its window.
+
+        Args:
+            geometry: that of :meth:`geometry_and_gaussians`, which comes first.
+            calibration: calibration of the model; None: no errors are stated.
+
+        Returns:
+            ``[V, H, W]`` each, as of :func:`vg2gt.reconstruction.trust.pixel_trust`; the error is memory-mapped.
+        """
+        status = torch.zeros(self.raw.shape, dtype=torch.uint8)
+        error = None if calibration is None else self.store.array("error", self.raw.shape)
+        kept = self.store.array("kept") if self.model.visibility is not None else None
+        with self.monitor.stage("errors", len(self.windows)) as advance:
+            for window in self.windows:
+                views, own, mask = window.views, window.own, self.capture.mask
+                decoded = replace(
+                    geometry,
+                    depth=(self.raw[views] * self.units[views, None, None])[None].to(self.device),
+                    depth_conf=self.conf[None, views].to(self.device),
+                    cameras=geometry.cameras.select(views.to(self.device)),
+                )
+                keep = None if kept is None else (kept[None, views] > 0).to(self.device)
+                evidence, found = pixel_evidence(decoded, keep)
+                evidence, found = evidence[window.inner], found[window.inner]
+                if calibration is not None and error is not None:
+                    error[own] = calibration.error(evidence, found).cpu()
+                status[own] = found.cpu()
+                if mask is not None:
+                    status[own][mask[own] <= 0.5] = Status.UNSEEN
+                advance()
+        return error, status
 
     def survey(self) -> list[dict[str, Tensor]]:
         """Computes the depth of all views in their windows' units; returns what is needed to place each window."""
