@@ -71,7 +71,7 @@ def test_coverage_width_and_order() -> None:
     assert (found["held_50"], found["held_90"]) == (0.5, 0.75)
     assert (found["held_90_agreed"], found["held_90_single"]) == (pytest.approx(2 / 3), 1)
     assert math.isnan(found["held_90_contradicted"])
-    assert found["width_90"] == pytest.approx(0.0325)
+    assert found["width_90"] == pytest.approx(0.02)
     assert math.isnan(
         stated_error_metrics(torch.zeros(0), torch.zeros(4, 0), torch.zeros(0))["ause"]
     )  # nothing to score

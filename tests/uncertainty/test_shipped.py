@@ -41,7 +41,7 @@ def measured(model: LoadedModel, rooms: int, views: int, noisy: float = 0.25) ->
     bounds = model.calibration.bounds(pixels.evidence, pixels.status)
     held = (pixels.error <= bounds).double().mean(-1).tolist()
     shares = {f"{level:.0%}": share for level, share in zip(LEVELS, held, strict=True)}
-    return shares | {"width": float(bounds[2].double().mean())}
+    return shares | {"width": float(bounds[2].double().median())}
 
 
 def test_it_belongs_to_the_shipped_weights(shipped: LoadedModel) -> None:

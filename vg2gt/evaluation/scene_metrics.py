@@ -104,7 +104,7 @@ def stated_error_metrics(error: Tensor, bounds: Tensor, status: Tensor) -> dict[
         status: ``[N]`` :class:`vg2gt.visibility.Status` of the pixels.
 
     Returns:
-        For each level, ``held_90``, the share of errors within the bound, and ``width_90``, the mean bound;
+        For each level, ``held_90``, the share of errors within the bound, and ``width_90``, the median bound;
         ``held_90_agreed`` and so on, the share for the pixels of each status with a depth, at the level of the stated
         error; and ``ause``, :func:`ause` of the last level's bound. NaN without pixels.
     """
@@ -112,7 +112,7 @@ def stated_error_metrics(error: Tensor, bounds: Tensor, status: Tensor) -> dict[
     for level, bound in zip(LEVELS, bounds, strict=True):
         name, held = f"{100 * level:.0f}", (error <= bound).double()
         scores[f"held_{name}"] = float(held.mean())
-        scores[f"width_{name}"] = float(bound.double().mean())
+        scores[f"width_{name}"] = float(bound.median()) if len(bound) else float("nan")
         if level == STATED:
             for kind in MEASURED:
                 scores[f"held_{name}_{kind.name.lower()}"] = float(held[status == kind].mean())

@@ -46,7 +46,7 @@ METRICS = {
     "recall": Metric("recall", 3, True),
     "f_score": Metric("F-score", 3, True),
     **{f"held_{level}": Metric(f"within the {level} % bound", 3) for level in (50, 80, 90, 95)},
-    **{f"width_{level}": Metric(f"mean {level} % bound", 4, False) for level in (50, 80, 90, 95)},
+    **{f"width_{level}": Metric(f"median {level} % bound", 4, False) for level in (50, 80, 90, 95)},
     "ause": Metric("AUSE", 3, False),
     "cv": Metric("CV", 3, False),
     "gaussians": Metric("Gaussians", 0),
