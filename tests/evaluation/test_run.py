@@ -16,8 +16,8 @@ from vg2gt.data.base import DataError
 from vg2gt.evaluation.evaluator import SceneEvaluator
 from vg2gt.evaluation.run import evaluate
 from vg2gt.runs.checkpoints import read_checkpoint, write_checkpoint
-from vg2gt.runs.untrusted import read_run_config
 from vg2gt.runs.load import SHIPPED
+from vg2gt.runs.untrusted import read_run_config
 from vg2gt.training.loop import train
 
 
