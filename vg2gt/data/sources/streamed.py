@@ -92,8 +92,8 @@ class Streamed(SceneSource):
 @lru_cache(maxsize=8)
 def _opened(root: str, process: int) -> Any:
     """Opens a stream in this process: open files and threads do not survive a fork."""
-    from litdata import StreamingDataset
-    from litdata.streaming.serializers import _SERIALIZERS, BytesSerializer
+    from litdata import StreamingDataset  # pyright: ignore[reportMissingImports]
+    from litdata.streaming.serializers import _SERIALIZERS, BytesSerializer  # pyright: ignore[reportMissingImports]
 
     # whatever a stream says its items are, they are taken as bytes and not unpickled
     return StreamingDataset(root, serializers={name: BytesSerializer() for name in _SERIALIZERS})
@@ -115,7 +115,7 @@ def write_stream(
         DataError: if litdata is missing, or a frame cannot be read.
     """
     try:
-        from litdata import optimize
+        from litdata import optimize  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise DataError(f"streams are written with litdata: pip install 'vg2gt[stream]' ({error})") from error
     packer = _Packer(source, tuple(scenes), prepare)
@@ -168,4 +168,5 @@ def _pack(frames: Frames) -> bytes:
 def _unpack(item: bytes) -> Frames:
     tensors: dict[str, Any] = load(item)
     tensors["images"] = from_bytes(tensors["images"])
-    return Frames(**tensors | {"sparse_depth": bool(tensors["sparse_depth"])})
+    tensors["sparse_depth"] = bool(tensors["sparse_depth"])
+    return Frames(**tensors)
