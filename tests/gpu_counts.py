@@ -135,11 +135,11 @@ RENDER = Counter({"the renderer's operations and kernels": 33})
 
 def count_step(step: Callable[[], Any]) -> tuple[Counter[str], Counter[str]]:
     """Operations and waits of a training step on a GPU; the renderer counts as ``RENDER`` and one wait."""
-    from vg2gt.kernels import curve_codes
+    from vg2gt.method import serialization
     from vg2gt.profiling import listening
 
     quiet = [0]
-    hilbert = curve_codes.hilbert_reference
+    hilbert = serialization.hilbert_codes
     codes: Counter[str] = Counter()
 
     @contextmanager
@@ -154,7 +154,7 @@ def count_step(step: Callable[[], Any]) -> tuple[Counter[str], Counter[str]]:
             return hilbert(*args)
 
     operations, waits = Operations(lambda: quiet[0] > 0), Waits()
-    with as_on_a_gpu(), mock.patch.object(curve_codes, "hilbert_reference", in_one_kernel), listening(rendering):
+    with as_on_a_gpu(), mock.patch.object(serialization, "hilbert_codes", in_one_kernel), listening(rendering):
         step()  # warm-up, as some checks run in the first step only
         codes.clear()
         with operations:

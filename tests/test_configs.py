@@ -81,7 +81,7 @@ def test_every_option_composes_and_fits_its_constructor(tmp_path: Path, group: s
     if group in ("loss", "renderer", "optimizer"):
         assert callable(instantiate(config[group]))
     assert assert_signatures_fit(OmegaConf.to_container(config[group], resolve=True)) >= 1
-    if group == "data" and name not in ("synthetic", "paper_mix"):  # scenes in files
+    if group == "data" and name not in ("synthetic", "paper_mix", "stream"):  # scenes in files
         assert {"every", "index_cache", "max_views"} <= set(config.data)
 
 

@@ -16,6 +16,7 @@ from vg2gt.data.base import DataError
 from vg2gt.evaluation.evaluator import SceneEvaluator
 from vg2gt.evaluation.run import evaluate
 from vg2gt.runs.checkpoints import read_checkpoint, write_checkpoint
+from vg2gt.runs.load import SHIPPED
 from vg2gt.runs.untrusted import read_run_config
 from vg2gt.training.loop import train
 
@@ -165,6 +166,19 @@ def test_a_lone_checkpoint_is_not_checked_and_that_is_told(tmp_path: Path, cache
         config[part] = parts[part]
     evaluate(config)
     assert "cannot check whether the evaluated scenes were used for training" in caplog.text
+
+
+def test_a_shipped_model_is_found_by_its_name(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Path | None] = []
+
+    def resolve(config: object, checkpoint: Path | None) -> None:
+        asked.append(checkpoint)
+        raise InterruptedError
+
+    monkeypatch.setattr("vg2gt.evaluation.run.resolve_parts", resolve)
+    with pytest.raises(InterruptedError):
+        run(tmp_path, cache, "ckpt=sweep-tiny")
+    assert asked == [SHIPPED]
 
 
 def test_what_is_missing_or_wrong_is_named(tmp_path: Path, cache: Path, trained: Path) -> None:

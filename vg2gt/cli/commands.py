@@ -53,7 +53,9 @@ COMMANDS = {
     "export": Command(
         "writes a frozen network as an ONNX bundle", "vg2gt export backend=da3_small --out bundles/da3_small"
     ),
-    "data": Command("makes splits and lists of views", "vg2gt data splits data=rgbd data.root=RECORDINGS --out lists"),
+    "data": Command(
+        "makes splits, lists of views and streams", "vg2gt data splits data=rgbd data.root=RECORDINGS --out lists"
+    ),
     "doctor": Command("shows packages, devices and renderer; on a GPU, checks the renderer's kernels", "vg2gt doctor"),
 }
 
@@ -65,6 +67,10 @@ DATA_COMMANDS = {
     "views": Command(
         "draws the views of an evaluation and writes an index",
         "vg2gt data views evaluation=rgbd data.root=RECORDINGS --out views.json",
+    ),
+    "stream": Command(
+        "writes a dataset as streams for training from object storage",
+        "vg2gt data stream data=rgbd data.root=RECORDINGS --out s3://bucket/scans",
     ),
 }
 

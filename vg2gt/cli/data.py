@@ -1,4 +1,4 @@
-"""``vg2gt data splits | views``: prepares lists of scenes and views for training and evaluation."""
+"""``vg2gt data splits | views | stream``: prepares lists of scenes and views, and streams, of a dataset."""
 
 from __future__ import annotations
 
@@ -23,6 +23,9 @@ VIEWS = """
 key=value arguments are those of vg2gt evaluate: the data, its scenes (data.eval_scenes), the numbers of views and how
 they are drawn (evaluation.selection). Use the file with evaluation.selection.index=FILE.json. The same arguments and
 data give the same file."""
+STREAM = """
+key=value arguments choose the dataset as in vg2gt train. Frames are resized to data.image_size. Train from them with
+data=stream data.root=DIR data.image_size=[H,W] (the same size)"""
 
 
 def main() -> None:
@@ -56,6 +59,27 @@ def views(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", required=True, metavar="FILE.json", help="the index to write")
     with errors_in_one_line():
         print(write_views(parser.parse_args(given).out, overrides))
+
+
+def stream(argv: Sequence[str] | None = None) -> None:
+    """Writes the training and evaluation scenes of a dataset as two streams."""
+    given, overrides = separate(argv)
+    parser = flag_parser("data stream", STREAM)
+    parser.add_argument("--out", required=True, metavar="DIR", help="folder or address, such as s3://bucket/scans")
+    parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes, default 1")
+    options = parser.parse_args(given)
+    with errors_in_one_line():
+        from hydra.utils import instantiate
+
+        from vg2gt.data.sources.streamed import write_stream
+
+        data: SceneDataModule = instantiate(compose("train", *overrides).data)
+        sources = {"train": (data.train_source(), data.train_scenes), "val": (data.val_source(), data.eval_scenes)}
+        for split, (source, limit) in sources.items():
+            out = f"{options.out.rstrip('/')}/{split}"
+            scenes = list(source.scenes)[:limit]
+            write_stream(source, scenes, data.prepare, out, options.workers)
+            print(f"{out}: {len(scenes)} scenes, {sum(len(source.frames(scene)) for scene in scenes)} frames")
 
 
 def write_views(out: str, overrides: Sequence[str]) -> Path:

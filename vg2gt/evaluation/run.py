@@ -35,6 +35,7 @@ from vg2gt.model import Reconstructor
 from vg2gt.runs.checkpoints import checkpoint_path
 from vg2gt.runs.load import TrainedWeights, build_model, choose_device, find_calibration, load_weights, resolve_parts
 from vg2gt.runs.lock import only_process_in
+from vg2gt.runs.pretrained import MODELS
 
 log = logging.getLogger(__name__)
 
@@ -69,7 +70,7 @@ def evaluate(config: DictConfig) -> dict[str, Any]:
     with only_process_in(folder):
         counts = view_counts(config.views)
         options: EvaluationOptions = instantiate(config.evaluation, _convert_="all")
-        checkpoint = checkpoint_path(config.ckpt)
+        checkpoint = checkpoint_path(MODELS.get(config.ckpt, config.ckpt))
         parts = resolve_parts(config, checkpoint)
         datamodule: SceneDataModule = instantiate(config.data)
         data = datamodule.evaluation_data()

@@ -27,7 +27,7 @@ from vg2gt.rendering.options import RenderOptions
 from vg2gt.rendering.scenes import Images, SceneViews
 
 TILES_PER_ITEM = 8
-HIT_CAPACITY = 192  # hits per block of rays for the depth solver; a tile with more gets a larger buffer
+HIT_CAPACITY = 128  # hits per ray for the depth solver, even; a tile with more gets a larger buffer
 CACHE_LINE = 64  # bytes
 
 _local = threading.local()
@@ -188,8 +188,8 @@ def _scratch(dtype: np.dtype) -> SimpleNamespace:
         buffers[dtype] = SimpleNamespace(
             state=_aligned(tiles.PLANES * tiles.PLANE, dtype),
             sums=_aligned(tiles.SUMS_ROWS * tiles.LANES, dtype),
-            hits=_aligned(tiles.BLOCKS * HIT_CAPACITY * tiles.HIT_SIZE, dtype),
-            counts=np.zeros(tiles.BLOCKS, np.int64),
+            hits=_room_for_hits(HIT_CAPACITY, dtype),
+            counts=np.zeros(tiles.PLANE, np.int64),
             staged=np.zeros((tiles.STAGED, tiles.RECORD + 3), dtype),
             touched=np.zeros(tiles.STAGED, np.int64),
             total=np.empty(16, np.float64),
@@ -204,6 +204,13 @@ def _aligned(count: int, dtype: np.dtype) -> np.ndarray:
     memory = np.empty(count * dtype.itemsize + CACHE_LINE, np.uint8)
     start = -memory.ctypes.data % CACHE_LINE
     return memory[start : start + count * dtype.itemsize].view(dtype)
+
+
+def _room_for_hits(each: int, dtype: np.dtype) -> np.ndarray:
+    """Allocates room for ``each`` hits of every ray of a tile, and the entry at hand; all finite."""
+    hits = _aligned((tiles.BLOCKS * each + 1) * tiles.HIT_SIZE, dtype)
+    hits[:] = 0
+    return hits
 
 
 def _forward(view: _View, lists: _Lists, options: RenderOptions, *outputs: np.ndarray) -> None:
@@ -225,7 +232,8 @@ def _forward(view: _View, lists: _Lists, options: RenderOptions, *outputs: np.nd
                 scratch.state, hits, scratch.counts, scratch.staged, scratch.touched, *outputs,
             )  # fmt: skip
             if first < last:
-                hits = _aligned(tiles.BLOCKS * (int(scratch.counts.max()) + 1) * tiles.HIT_SIZE, view.means.dtype)
+                most = int(scratch.counts.max())
+                hits = _room_for_hits(most + most % 2, view.means.dtype)
 
     parallel_for(view.tile_ranges, run)
 

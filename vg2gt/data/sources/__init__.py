@@ -1,4 +1,4 @@
-"""Loaders of datasets on disk, one module per layout; all are subclasses of ``FileSource``."""
+"""Loaders of datasets on disk, one module per layout; all but streams are subclasses of ``FileSource``."""
 
 from vg2gt.data.sources.colmap_model import COLMAP
 from vg2gt.data.sources.infinigen import Infinigen
@@ -6,6 +6,7 @@ from vg2gt.data.sources.kitti import KITTI
 from vg2gt.data.sources.nerfstudio import Nerfstudio
 from vg2gt.data.sources.replica import Replica
 from vg2gt.data.sources.rgbd import ScanNet
+from vg2gt.data.sources.streamed import Streamed
 
 __all__ = [
     "COLMAP",
@@ -14,4 +15,5 @@ __all__ = [
     "Nerfstudio",
     "Replica",
     "ScanNet",
+    "Streamed",
 ]

@@ -2,9 +2,9 @@
 
 A tile's Gaussians are visited front to back. Each touches some of the tile's blocks of 4 x 4 pixels; a block is one
 vector operation. The state of a tile lies in planes of one flat scratch array, whose constant offsets let the compiler
-vectorise. A stopped ray has a negative transmittance. For the median depth, every block stores the hits of its rays:
-one entry for all 16 rays, with opacity 0 for those that are not hit. Kernels are generic in the dtype: constants that
-are exact in float32 do not change the dtype of results; all others are passed in an array.
+vectorise. A stopped ray has a negative transmittance. For the median depth, every ray stores its own hits; entry n of
+a block holds the n-th hit of each of its 16 rays. Kernels are generic in the dtype: constants that are exact in float32
+do not change the dtype of results; all others are passed in an array.
 """
 
 # Written for the compiler: flat bodies; short names follow the formulas in rendering/projection.py.
@@ -33,15 +33,52 @@ from vg2gt.rendering.cpu.tiles import (
     STAGED,
     TILE,
     alive_blocks,
-    any_positive,
     attenuate,
     find_blocks,
     lowest_bit,
     place_of,
+    positive_lanes,
     respond,
     stage,
     start_rays,
 )
+
+
+@kernel_part(fastmath=FAST, error_model="numpy")
+def _first_entry(hits, block):
+    """Returns where a block's entries begin, and how many there is room for; entry 0 of all is the Gaussian at hand."""
+    capacity = (len(hits) // HIT_SIZE - 1) // BLOCKS
+    return 1 + block * capacity, capacity
+
+
+@kernel_part(fastmath=FAST, error_model="numpy")
+def _append(hits, counts, block):
+    """Copies the hits in entry 0 to the ends of their rays' lists."""
+    first, capacity = _first_entry(hits, block)
+    lanes = positive_lanes(hits, np.uintp(0))  # pyright: ignore[reportCallIssue]
+    while lanes:
+        lane = np.uintp(lowest_bit(lanes))  # pyright: ignore[reportCallIssue]
+        lanes &= lanes - 1
+        ray = np.uintp(block * LANES) + lane
+        to = np.uintp((first + min(counts[ray], capacity - 1)) * HIT_SIZE) + lane
+        hits[to] = hits[lane]
+        hits[to + planes.HIT_PEAK] = hits[lane + planes.HIT_PEAK]
+        hits[to + planes.HIT_PRECISION] = hits[lane + planes.HIT_PRECISION]
+        counts[ray] += 1
+
+
+@kernel_part(fastmath=FAST, error_model="numpy")
+def _fill_up(hits, counts, block):
+    """Gives all rays of a block the same even number of entries, of opacity 0 where they have none; returns it."""
+    first, _ = _first_entry(hits, block)
+    most = 0
+    for lane in range(LANES):
+        most = max(most, counts[block * LANES + lane])
+    most += most % 2
+    for lane in range(LANES):
+        for c in range(counts[block * LANES + lane], most):
+            hits[(first + c) * HIT_SIZE + lane] = ZERO
+    return first, most
 
 
 def _make_blend_tile(geometry: bool, solid: bool) -> Callable[..., Any]:
@@ -53,11 +90,10 @@ def _make_blend_tile(geometry: bool, solid: bool) -> Callable[..., Any]:
     ):
         """Blends one tile front to back.
 
-        ``counts`` receives each block's number of hits for the depth solver, ``visits`` a bit mask of the blocks that
+        ``counts`` receives each ray's number of hits for the depth solver, ``visits`` a bit mask of the blocks that
         each Gaussian changes, for the backward pass.
         """
         alpha_max, stop, negligible = parameters[0], parameters[1], parameters[4]
-        capacity = len(hits) // (BLOCKS * HIT_SIZE)
         alive = 0
         for p in range(len(members)):
             j = p % STAGED
@@ -80,8 +116,6 @@ def _make_blend_tile(geometry: bool, solid: bool) -> Callable[..., Any]:
                 top = np.float32(y_tile + block // BLOCKS_ACROSS * SIDE) - vc
                 left = np.float32(x_tile + block % BLOCKS_ACROSS * SIDE) - uc
                 base = np.uintp(block * LANES)
-                slot = min(counts[block], capacity - 1) if solid else 0
-                place = np.uintp((block * capacity + slot) * HIT_SIZE)
                 hit = False
                 for lane in range(LANES):
                     v = np.uintp(lane)
@@ -123,41 +157,53 @@ def _make_blend_tile(geometry: bool, solid: bool) -> Callable[..., Any]:
                             beyond = peak - hi
                             near_enough = (beyond <= ZERO) | (precision * beyond * beyond <= negligible)
                             matters = (alpha > ZERO) & (early | near_enough)
-                            # an entry that does not matter is overwritten by the next hit
-                            to = place + v
-                            hits[to] = alpha if matters else ZERO
-                            hits[to + planes.HIT_PEAK] = peak
-                            hits[to + planes.HIT_PRECISION] = precision
+                            hits[v] = alpha if matters else ZERO
+                            hits[v + planes.HIT_PEAK] = peak
+                            hits[v + planes.HIT_PRECISION] = precision
                         else:
                             state[k + planes.MEAN] += weight * peak
                 if solid:
-                    counts[block] += np.int64(any_positive(hits, place))  # pyright: ignore[reportCallIssue]
+                    _append(hits, counts, block)
                 changed |= np.int64(hit) << block
             visits[p] = changed
 
     return blend_tile
 
 
+@kernel_part(fastmath=FAST, error_model="numpy", forceinline=True)
+def _pass_hit(hit, lane, t, num, den, slope):
+    """Multiplies one hit into T^2 = num / den at depth t, and adds it to the slope ``-d ln T^2 / dt``."""
+    alpha, precision = hit[lane], hit[lane + planes.HIT_PRECISION]
+    d = t - hit[lane + planes.HIT_PEAK]
+    g = alpha * exp(-HALF * precision * d * d)
+    free = ONE - g
+    front = d <= ZERO
+    num *= free if front else (ONE - alpha) * (ONE - alpha)
+    den *= ONE if front else free
+    return num, den, slope + g * precision * abs(d) / free
+
+
 @kernel_part(fastmath=FAST, error_model="numpy")
 def _transmit(state, hits, first, count, base):
-    """Computes T^2 = NUM / DEN at the depths in plane MEDIAN; its slope ``-d ln T^2 / dt`` goes to plane MEAN."""
+    """Computes T^2 = NUM / DEN at the depths in plane MEDIAN; its slope ``-d ln T^2 / dt`` goes to plane MEAN.
+
+    Takes two hits at a time: while one's quotient is computed, the other is in the works.
+    """
     for lane in range(LANES):
         k = base + np.uintp(lane)
         state[k + planes.NUM] = ONE
         state[k + planes.DEN] = ONE
         state[k + planes.MEAN] = ZERO
-    for c in range(first, first + count):
-        hit = hits[c * HIT_SIZE : (c + 1) * HIT_SIZE]
+    for c in range(first, first + count, 2):
+        pair = hits[c * HIT_SIZE : (c + 2) * HIT_SIZE]
         for lane in range(LANES):
-            k = base + np.uintp(lane)
-            alpha, precision = hit[np.uintp(lane)], hit[np.uintp(lane) + planes.HIT_PRECISION]
-            d = state[k + planes.MEDIAN] - hit[np.uintp(lane) + planes.HIT_PEAK]
-            g = alpha * exp(-HALF * precision * d * d)
-            free = ONE - g
-            front = d <= ZERO
-            state[k + planes.NUM] *= free if front else (ONE - alpha) * (ONE - alpha)
-            state[k + planes.DEN] *= ONE if front else free
-            state[k + planes.MEAN] += g * precision * abs(d) / free
+            v = np.uintp(lane)
+            k = base + v
+            t = state[k + planes.MEDIAN]
+            num, den, slope = state[k + planes.NUM], state[k + planes.DEN], state[k + planes.MEAN]
+            num, den, slope = _pass_hit(pair, v, t, num, den, slope)
+            num, den, slope = _pass_hit(pair, v + planes.NEXT_HIT, t, num, den, slope)
+            state[k + planes.NUM], state[k + planes.DEN], state[k + planes.MEAN] = num, den, slope
 
 
 @kernel_part(fastmath=FAST, error_model="numpy")
@@ -191,16 +237,16 @@ def _bracket(state, hits, first, count, base, median_max, near, newton):
 
 
 @kernel_part(fastmath=FAST, error_model="numpy")
-def _solve(state, hits, block, count, parameters, steps, newton):
+def _solve(state, hits, counts, block, parameters, steps, newton):
     """Writes the median depth of a block's rays (0: none) to plane MEDIAN, its slope S to MEAN; stops if converged."""
-    tolerance = parameters[5]
-    base, first = np.uintp(block * LANES), block * (len(hits) // (BLOCKS * HIT_SIZE))
+    tolerance, base = parameters[5], np.uintp(block * LANES)
+    first, count = _fill_up(hits, counts, block)
     _bracket(state, hits, first, count, base, parameters[2], parameters[3], newton)
     for lane in range(LANES):
         k = base + np.uintp(lane)
         state[k + planes.SOUGHT] = state[k + planes.MOVING]
     for _ in range(steps):
-        if not any_positive(state, base + planes.MOVING):  # pyright: ignore[reportCallIssue]
+        if positive_lanes(state, base + planes.MOVING) == 0:  # pyright: ignore[reportCallIssue]
             break
         _transmit(state, hits, first, count, base)
         for lane in range(LANES):
@@ -270,13 +316,10 @@ def _make_forward_tiles(geometry: bool, solid: bool) -> Callable[..., int]:
             else:
                 _blend_color(*args)
             if geometry and solid:
-                most = 0
-                for block in range(BLOCKS):
-                    most = max(most, counts[block])
-                if (most + 1) * HIT_SIZE * BLOCKS > len(hits):  # one spare entry for hits that do not matter
+                if counts.max() > _first_entry(hits, 0)[1]:
                     return tile
                 for block in range(BLOCKS):
-                    _solve(state, hits, block, counts[block], parameters, steps, newton)
+                    _solve(state, hits, counts, block, parameters, steps, newton)
             for y in range(rows):
                 for x in range(columns):
                     k = place_of(y, x)

@@ -13,5 +13,5 @@ REST, G0, G1, G2, G3, G4, G5, DEPTH, KD, GE, GM = (np.uintp(j * PLANE) for j in 
 AX, AY, AXX, AXY, AYY, B, BX, BY, GR, GO, K0, K1, K2, M0, M1, M2, GZ, GP = (
     np.uintp(j * LANES) for j in range(SUMS_ROWS)
 )
-# one hit of a block's rays
-HIT_PEAK, HIT_PRECISION = np.uintp(LANES), np.uintp(2 * LANES)
+# one hit of each of a block's rays, and the next
+HIT_PEAK, HIT_PRECISION, NEXT_HIT = (np.uintp(j * LANES) for j in (1, 2, 3))

@@ -23,7 +23,7 @@ LANE_X, LANE_Y = (offset.ravel().astype(np.float32) for offset in np.meshgrid(np
 PLANE = TILE * TILE
 PLANES = 17  # planes of a tile's state
 SUMS_ROWS = 18  # gradient sums of one Gaussian, LANES values each
-HIT_SIZE = 3 * LANES  # one hit of a block's rays: alpha, peak, precision
+HIT_SIZE = 3 * LANES  # one hit of each of a block's rays: alpha, peak, precision
 FIRST_COLUMN = sum(1 << row * BLOCKS_ACROSS for row in range(BLOCKS_ACROSS))  # bit mask of blocks
 STAGED = 16  # Gaussians copied at a time, with their colours
 RECORD = 16  # projected Gaussian: centre 2, conic 3, tilt 2, z, a0, eps, opacity, cutoff, normal 3, unused
@@ -31,8 +31,8 @@ ROW = 16  # gradient of one (tile, Gaussian): centre 2, conic 3, tilt 2, z, a0, 
 
 
 @intrinsic
-def any_positive(typing_context, values, first):
-    """Whether any of a block's values is positive, in one vector comparison; the compiler would use a scalar loop."""
+def positive_lanes(typing_context, values, first):
+    """Bit mask of a block's positive values, in one vector comparison; the compiler would use a scalar loop."""
 
     def codegen(context, builder, signature, args):
         array, item = signature.args[0], context.get_data_type(signature.args[0].dtype)
@@ -40,10 +40,9 @@ def any_positive(typing_context, values, first):
         lanes = builder.bitcast(begin, ir.VectorType(item, LANES).as_pointer())
         loaded = builder.load(lanes, align=context.get_abi_alignment(item))
         positive = builder.fcmp_ordered(">", loaded, ir.Constant(loaded.type, [0.0] * LANES))
-        bits = ir.IntType(LANES)
-        return builder.icmp_unsigned("!=", builder.bitcast(positive, bits), bits(0))
+        return builder.zext(builder.bitcast(positive, ir.IntType(LANES)), ir.IntType(64))
 
-    return types.boolean(values, first), codegen
+    return types.int64(values, first), codegen
 
 
 @intrinsic
@@ -75,7 +74,8 @@ def alive_blocks(state):
     """Returns a bit mask of the blocks in which a ray has not stopped."""
     alive = 0
     for block in range(BLOCKS):
-        alive |= np.int64(any_positive(state, np.uintp(block * LANES))) << block  # pyright: ignore[reportCallIssue]
+        lanes = positive_lanes(state, np.uintp(block * LANES))  # pyright: ignore[reportCallIssue]
+        alive |= np.int64(lanes != 0) << block
     return alive
 
 
