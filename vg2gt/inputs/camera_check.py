@@ -18,6 +18,7 @@ from vg2gt.data.transforms import reduce_to_fit, to_bytes
 from vg2gt.inputs.folds import Matches
 from vg2gt.inputs.pictures import Picture, spread
 from vg2gt.inputs.sfm import find_features, match_features
+from vg2gt.io.cameras_json import invert_pose
 from vg2gt.io.colmap import PIXEL_CENTER, quiet_colmap
 from vg2gt.io.errors import some
 from vg2gt.monitor import Monitor
@@ -45,9 +46,9 @@ class CheckedView:
 
 
 _READINGS: dict[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
-    "camera-to-world instead of world-to-camera, or the reverse": np.linalg.inv,
+    "camera-to-world instead of world-to-camera, or the reverse": invert_pose,
     "in OpenGL axes instead of OpenCV's, or the reverse": lambda pose: _FLIP @ pose,
-    "both inverse and in the other of OpenGL's and OpenCV's axes": lambda pose: np.linalg.inv(pose @ _FLIP),
+    "both inverse and in the other of OpenGL's and OpenCV's axes": lambda pose: invert_pose(pose @ _FLIP),
 }
 
 

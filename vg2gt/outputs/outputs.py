@@ -33,7 +33,7 @@ from vg2gt.io import (
     write_tiles,
     write_transforms,
 )
-from vg2gt.io.files import whole_folder, write_bytes, write_json
+from vg2gt.io.files import portable, whole_folder, write_bytes, write_json
 from vg2gt.io.images import colorize_depth, colorize_normals, grid, to_pixels, write_png
 from vg2gt.io.video import video_writer
 from vg2gt.monitor import Monitor
@@ -203,7 +203,7 @@ def map_folder(folder: Path, output: str) -> Iterator[AddView]:
 
         def add(view: RenderedView) -> None:
             """Writes the map of one view."""
-            name = view_stem(view.camera.name)
+            name = portable(view_stem(view.camera.name))
             target = staged / f"{name}{suffix}"
             if not target.resolve().is_relative_to(staged.resolve()):
                 raise ValueError(f"view name {view.camera.name!r} leads outside the output folder; rename it")
