@@ -52,9 +52,9 @@ def test_right_cameras_pass_and_those_of_a_sparse_model_are_known(right: list[Pi
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda _, pose: np.linalg.inv(pose), "if the poses are camera-to-world instead"),
+        (lambda _, pose: np.linalg.inv(pose), "world-to-camera, or the reverse: correct"),
         (lambda _, pose: FLIP @ pose, "if the poses are in OpenGL axes"),
-        (lambda _, pose: np.linalg.inv(pose) @ FLIP, "if the poses are both inverse and"),
+        (lambda _, pose: np.linalg.inv(pose) @ FLIP, "or the reverse, and in the other of OpenGL's"),
         (lambda number, pose: None, "Check their order"),
     ],
 )
@@ -68,6 +68,10 @@ def test_what_is_wrong_is_said(right: list[Picture], change, said: str, caplog) 
         check_cameras(wrong, Monitor())
     assert said in str(error.value)
     assert "--poses sfm" in str(error.value)
+    with pytest.raises(DataError) as error:
+        check_cameras([replace(each, source="Nerfstudio folder") for each in wrong], Monitor())
+    if "in the other of" in said:  # a transforms.json has OpenGL axes, so its poses are only inverse
+        assert "world-to-camera, or the reverse: correct" in str(error.value)
     check_cameras(wrong, Monitor(), insisted=True)
     assert "they are used as they are" in caplog.text
 

@@ -45,10 +45,12 @@ class CheckedView:
     size: tuple[int, int]
 
 
+_INVERSE = "camera-to-world instead of world-to-camera, or the reverse"
+_BOTH = f"{_INVERSE}, and in the other of OpenGL's and OpenCV's axes"
 _READINGS: dict[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
-    "camera-to-world instead of world-to-camera, or the reverse": invert_pose,
+    _INVERSE: invert_pose,
     "in OpenGL axes instead of OpenCV's, or the reverse": lambda pose: _FLIP @ pose,
-    "both inverse and in the other of OpenGL's and OpenCV's axes": lambda pose: invert_pose(pose @ _FLIP),
+    _BOTH: lambda pose: invert_pose(pose @ _FLIP),
 }
 
 
@@ -84,18 +86,19 @@ def check_cameras(pictures: Sequence[Picture], monitor: Monitor, insisted: bool 
     if len(against) < _CONTRADICTED * len(shares):
         log.warning("%s; some cameras may be wrong, or the images show things that look alike or move", said)
         return
-    said = f"{said}. {_advice(matches, views)}"
+    said = f"{said}. {_advice(matches, views, pictures[0].source.startswith('Nerfstudio'))}"
     if not insisted:
         raise DataError(f"{said}; --poses sfm finds the cameras from the images, --poses given takes these as they are")
     log.warning("%s; they are used as they are", said)
 
 
-def _advice(matches: Matches, views: dict[str, CheckedView]) -> str:
-    """Says what is wrong with contradicted cameras."""
+def _advice(matches: Matches, views: dict[str, CheckedView], is_opengl: bool) -> str:
+    """Says what is wrong with contradicted cameras, in the axes of their file."""
     for reading, change in _READINGS.items():
         changed = {name: replace(view, pose=change(view.pose)) for name, view in views.items()}
         if min(agreement(matches, changed).values()) >= _FITTING:
-            return f"They fit if the poses are {reading}: correct them"
+            swapped = {_INVERSE: _BOTH, _BOTH: _INVERSE} if is_opengl else {}
+            return f"They fit if the poses are {swapped.get(reading, reading)}: correct them"
     return "Check their order, axes and focal length"
 
 

@@ -1,4 +1,4 @@
-"""Leaves out pictures that show nothing (damaged, black, blurred, hidden) and masks the black borders of others.
+"""Leaves out pictures that show nothing (damaged, black, blurred, hidden) or nothing new, and masks black borders.
 
 Undistorted photographs have borders that are black in all images of a size and end abruptly. A dark background does
 neither: its edge differs from image to image.
@@ -7,8 +7,10 @@ neither: its edge differs from image to image.
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -31,8 +33,10 @@ _BLACK, _WHITE = 12, 250  # values of 255 up to and from which a pixel shows not
 _NOISE = 4  # pixels over which noise is averaged
 _ALL, _NEARLY_ALL, _USUAL = 0.995, 0.9, 0.5  # shares of such pixels: always, or where most images have fewer than usual
 _FLAT = 1.0  # standard deviation of the brightness of an image that shows nothing
+_GREY, _COLORFUL = 3, 20  # difference of the channels in 99 of 100 pixels: of a grey image, of a coloured one
 _COARSE = (4, 16)  # pixels of structures that blur leaves
 _BLURRED = 0.03  # least detail of 1 pixel in the worst direction, relative to the coarse one and to the images' median
+_SAME = 6.0  # mean difference of 255 of one photograph in two formats
 _SHOWN = 0.001  # share of the pixels that a mask shows at least
 _FEWEST = 3  # images that are compared with each other
 _BORDER, _LIT = 6, 24  # values of 255 of a border at most, and of the image next to it at least
@@ -44,12 +48,15 @@ _OFTEN = 0.7  # share of the images, and of the pixels along the border, in whic
 
 @dataclass(frozen=True)
 class _Look:
-    """What a small copy of a picture shows: shares of black and white pixels, spread and detail of the brightness."""
+    """What a small copy of a picture shows: shares of black and white pixels, spread and detail of the brightness,
+    and how much the channels differ.
+    """
 
     black: float
     white: float
     spread: float
     detail: float
+    color: float
 
 
 class _Borders:
@@ -79,6 +86,27 @@ class _Borders:
         return (~near).astype(np.float32) if len(often) and often.mean() >= _OFTEN else None
 
 
+class _Twins:
+    """Photographs of one name in several formats, such as IMG_1.HEIC and IMG_1.JPG."""
+
+    def __init__(self, pictures: Sequence[Picture]) -> None:
+        files = [each.path.with_suffix("") for each in pictures if each.path is not None]
+        self.seen: dict[Path, list[tuple[str, NDArray[np.uint8]]]] = {
+            name: [] for name, count in Counter(files).items() if count > 1
+        }
+
+    def of(self, picture: Picture, pixels: NDArray[np.uint8]) -> str:
+        """Returns the file name of an earlier photograph that shows the same; empty if there is none."""
+        earlier = self.seen.get(picture.path.with_suffix("")) if picture.path is not None else None
+        if earlier is None or picture.path is None:
+            return ""
+        for name, other in earlier:
+            if other.shape == pixels.shape and np.abs(other.astype(np.float32) - pixels).mean() < _SAME:
+                return name
+        earlier.append((picture.path.name, pixels))
+        return ""
+
+
 def usable_pictures(pictures: Sequence[Picture], monitor: Monitor) -> list[Picture]:
     """Returns the pictures that can be read and show something; those left out are named in a warning.
 
@@ -96,6 +124,7 @@ def usable_pictures(pictures: Sequence[Picture], monitor: Monitor) -> list[Pictu
     looks: dict[str, _Look] = {}
     faults: dict[str, str] = {}
     borders: dict[tuple[int, int], _Borders] = {}
+    twins = _Twins(pictures)
     with monitor.stage("check images", len(pictures)) as advance:
         for picture in pictures:
             try:
@@ -105,6 +134,8 @@ def usable_pictures(pictures: Sequence[Picture], monitor: Monitor) -> list[Pictu
             else:
                 if shown < _SHOWN:
                     faults[picture.name] = "is hidden by its mask (white in masks is what counts)"
+                if other := twins.of(picture, pixels):
+                    faults[picture.name] = f"is {other} in another format"
                 looks[picture.name] = _look(pixels)
                 if _may_have_borders(picture):
                     borders.setdefault(picture.size, _Borders(pixels.shape[:2])).add(pixels.max(2))
@@ -145,7 +176,8 @@ def _look(pixels: NDArray[np.uint8]) -> _Look:
     fine, *coarse = (curvatures(grey, step) for step in (1, *_COARSE))
     detail = float((fine / np.maximum(np.max(coarse, 0), 1e-6)).min())
     black, white = (smooth.max(2) <= _BLACK).mean(), (smooth.min(2) >= _WHITE).mean()
-    return _Look(float(black), float(white), float(smooth.mean(2).std()), detail)
+    color = float(np.quantile(np.ptp(smooth, axis=2), 0.99))
+    return _Look(float(black), float(white), float(smooth.mean(2).std()), detail, color)
 
 
 def _faults(looks: dict[str, _Look]) -> dict[str, str]:
@@ -153,8 +185,9 @@ def _faults(looks: dict[str, _Look]) -> dict[str, str]:
     if not looks:
         return {}
     several = len(looks) >= _FEWEST
-    black, white, detail = (
-        float(np.median([getattr(look, name) for look in looks.values()])) for name in ("black", "white", "detail")
+    black, white, detail, color = (
+        float(np.median([getattr(look, name) for look in looks.values()]))
+        for name in ("black", "white", "detail", "color")
     )
 
     def fault(look: _Look) -> str:
@@ -164,6 +197,8 @@ def _faults(looks: dict[str, _Look]) -> dict[str, str]:
             return "is over-exposed"
         if look.spread < _FLAT:
             return "is of one colour"
+        if several and look.color <= _GREY and color >= _COLORFUL:
+            return "is without colour (of a thermal or infrared camera?)"
         return "is blurred" if several and look.detail < _BLURRED * detail else ""
 
     return {name: found for name, look in looks.items() if (found := fault(look))}
