@@ -130,3 +130,32 @@ def test_measuring_cropping_and_views_to_keep() -> None:
     for field in ("width", "height", "intrinsics", "world_to_camera"):
         assert np.allclose(answer["back"][field], record[field])
     assert np.allclose(answer["axes"][1], [-1, 0, 0])  # down; the camera looks along z
+
+
+def test_fewer_gaussians_are_drawn_while_a_large_scene_moves() -> None:
+    """Slow frames halve them at most, fast ones bring them back; those that cover most are kept, in their order."""
+    answer = run("""
+        const count = 200000, geometry = new Float32Array(12 * count), means = new Float32Array(3 * count);
+        for (let i = 0; i < count; i++) {
+          geometry.set([0, 0, 1 + i / count, i % 2 ? 0.5 : 1, 1, 0, 0, 0, 0.001, 1 + i % 4, 1, 0], 12 * i);
+          means[3 * i + 2] = 1 + i / count;
+        }
+        const weights = weightsOf(geometry), detail = new Detail(weights), seen = [detail.least()];
+        const sort = makeDepthSorter(means, weights), shown = [];
+        for (const duration of [66, 10, 100, 1000, 1000]) {
+          detail.adapt(duration);
+          shown.push(detail.most);
+          seen.push(sort([0, 0, 1, 0], 0.1, null, detail.least()).length);
+        }
+        const kept = [...sort([0, 0, 1, 0], 0.1, null, detail.least())];
+        for (let i = 0; i < 20; i++) detail.adapt(16);
+        const sorted = kept.every((value, k) => !k || value < kept[k - 1]);
+        const kinds = [...new Set(kept.map((i) => i % 4))], first = [...weights.slice(0, 4)];
+        answer = { seen, shown, sorted, all: detail.least(), kinds, first };
+        """)
+    assert answer["first"] == [1, 1, 3, 2]
+    assert answer["shown"] == pytest.approx([100_000, 110_000, 55_000, 50_000, 50_000])
+    assert answer["seen"] == [0, 100_000, 200_000, 100_000, 50_000, 50_000]  # equal weights stay together
+    assert answer["kinds"] == [2]
+    assert answer["sorted"]
+    assert answer["all"] == 0
