@@ -23,6 +23,7 @@ from vg2gt.data.sources.masks import joined_masks, resized_mask
 from vg2gt.data.transforms import to_bytes
 from vg2gt.inputs.damaged import name_left_out, reason_of
 from vg2gt.inputs.pictures import IN_MEMORY, Picture
+from vg2gt.io.errors import some
 from vg2gt.io.images import curvatures
 from vg2gt.monitor import Monitor
 
@@ -38,6 +39,7 @@ _COARSE = (4, 16)  # pixels of structures that blur leaves
 _BLURRED = 0.03  # least detail of 1 pixel in the worst direction, relative to the coarse one and to the images' median
 _SAME = 6.0  # mean difference of 255 of one photograph in two formats
 _SHOWN = 0.001  # share of the pixels that a mask shows at least
+_WIDE, _HALF, _PAIR = 1.7, 32, 0.9  # shape of stereo pairs, pixels of a half, least correlation of the halves
 _FEWEST = 3  # images that are compared with each other
 _BORDER, _LIT = 6, 24  # values of 255 of a border at most, and of the image next to it at least
 _BORDERS = (0.001, 0.6)  # least and largest share of the pixels
@@ -57,6 +59,7 @@ class _Look:
     spread: float
     detail: float
     color: float
+    is_pair: bool
 
 
 class _Borders:
@@ -141,6 +144,12 @@ def usable_pictures(pictures: Sequence[Picture], monitor: Monitor) -> list[Pictu
                     borders.setdefault(picture.size, _Borders(pixels.shape[:2])).add(pixels.max(2))
             advance()
     faults |= _faults(looks)
+    pairs = [name for name, look in looks.items() if look.is_pair]
+    if 2 * len(pairs) > len(looks):
+        log.warning(
+            "%d images show the same twice, side by side, as stereo cameras and spatial photographs do: cut them into "
+            "their halves, or the scene will be wrong: %s", len(pairs), some(pairs),
+        )  # fmt: skip
     name_left_out(faults, len(pictures))
     masks = {size: mask for size, own in borders.items() if (mask := own.mask()) is not None}
     found = [each for each in pictures if each.name not in faults]
@@ -177,7 +186,21 @@ def _look(pixels: NDArray[np.uint8]) -> _Look:
     detail = float((fine / np.maximum(np.max(coarse, 0), 1e-6)).min())
     black, white = (smooth.max(2) <= _BLACK).mean(), (smooth.min(2) >= _WHITE).mean()
     color = float(np.quantile(np.ptp(smooth, axis=2), 0.99))
-    return _Look(float(black), float(white), float(smooth.mean(2).std()), detail, color)
+    return _Look(float(black), float(white), float(smooth.mean(2).std()), detail, color, _is_stereo_pair(pixels))
+
+
+def _is_stereo_pair(pixels: NDArray[np.uint8]) -> bool:
+    """Returns whether the left and the right half of a wide picture show the same, shifted a little."""
+    height, width = pixels.shape[:2]
+    if width < _WIDE * height:
+        return False
+    small = np.asarray(Image.fromarray(pixels).convert("L").resize((2 * _HALF, _HALF), Image.Resampling.BOX), float)
+    left, right = small[:, :_HALF], small[:, _HALF:]
+    if min(left.std(), right.std()) < _FLAT:
+        return False
+    halves, reach = ((left, right), (right, left)), range(_HALF // 8)  # also of crossed eyes
+    shifts = ((one[:, shift:], other[:, : _HALF - shift]) for one, other in halves for shift in reach)
+    return max(float(np.corrcoef(one.ravel(), other.ravel())[0, 1]) for one, other in shifts) > _PAIR
 
 
 def _faults(looks: dict[str, _Look]) -> dict[str, str]:

@@ -65,10 +65,12 @@ def fuse_solid(
     average = (total + free) / (near + free).clamp(min=1)
     values = torch.where(near > 0, average, torch.where(free >= _FREE, 1.0, -1.0)).reshape(shape).numpy()
     shades = (shade / near.clamp(min=1)[:, None]).reshape(*shape, 3).numpy()
-    found = _largest(ndimage.gaussian_filter(values, _SMOOTH))
-    nearest = ndimage.distance_transform_edt(
-        (near == 0).reshape(shape).numpy(), return_distances=False, return_indices=True
-    )
+    smooth = np.empty_like(values)
+    ndimage.gaussian_filter(values, _SMOOTH, output=smooth)
+    found = _largest(smooth)
+    nearest = np.zeros((3, *shape), np.int32)  # the voxel with a colour that is nearest to each
+    unknown = (near == 0).reshape(shape).numpy()
+    ndimage.distance_transform_edt(unknown, return_distances=False, return_indices=True, indices=nearest)
     joined = np.concatenate((found[..., None], shades[tuple(nearest)]), -1)
     return surface_of(index.reshape(-1, 3), torch.from_numpy(joined.reshape(-1, 4)), voxel_size)
 
