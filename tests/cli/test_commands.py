@@ -14,6 +14,7 @@ from hydra.errors import HydraException
 from tests.commands import shell
 from vg2gt import __version__
 from vg2gt.cli import main
+from vg2gt.cli.arguments import without_patterns
 from vg2gt.cli.commands import COMMANDS, DATA_COMMANDS, Command, dispatch
 
 Said = Callable[..., tuple[object, str]]
@@ -171,3 +172,11 @@ def test_tracebacks_are_there_for_who_asks(words, error, tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["vg2gt", *words.split()])
     with pytest.raises(error):
         main()
+
+
+def test_patterns_that_the_shell_has_not_expanded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in Windows' command prompt: ``photos\\*.jpg`` did not exist."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("10.jpg", "9.jpg", "a.png", "[b].jpg"):
+        (tmp_path / name).touch()
+    assert without_patterns(["?.jpg", "1*.jpg", "[b].jpg", "c*.png"]) == ["9.jpg", "10.jpg", "[b].jpg", "c*.png"]

@@ -28,13 +28,16 @@ def with_gps(path, position) -> Image.Exif:
     for angle in np.abs(position[:2]):
         minutes = angle % 1 * 60
         parts.append((float(int(angle)), float(int(minutes)), minutes % 1 * 60))
+    altitude = {
+        tags.GPSAltitudeRef: b"\0" if position[2] > 0 else b"\1",
+        tags.GPSAltitude: abs(position[2]),
+    }
     exif[ExifTags.IFD.GPSInfo] = {
         tags.GPSLatitudeRef: "N" if position[0] > 0 else "S",
         tags.GPSLatitude: parts[0],
         tags.GPSLongitudeRef: "E" if position[1] > 0 else "W",
         tags.GPSLongitude: parts[1],
-        tags.GPSAltitudeRef: b"\0" if position[2] > 0 else b"\1",
-        tags.GPSAltitude: abs(position[2]),
+        **(altitude if np.isfinite(position[2]) else {}),
     }
     with Image.open(path) as image:
         image.load()
@@ -72,6 +75,13 @@ def test_references_as_some_programs_write_them(tmp_path, side: str, sign: int |
     }
     Image.new("RGB", (8, 8)).save(tmp_path / "a.jpg", exif=exif)
     assert gps_position(tmp_path / "a.jpg") == (None if sign is None else (sign * 46.5, 7, 100))
+
+
+def test_a_position_without_an_altitude_does_not_count(tmp_path) -> None:
+    Image.new("RGB", (8, 8)).save(tmp_path / "a.jpg")
+    with_gps(tmp_path / "a.jpg", (46.5, 7, np.nan))
+    assert gps_position(tmp_path / "a.jpg") == pytest.approx((46.5, 7, np.nan), nan_ok=True)
+    assert fit_place(np.eye(5, 3), np.tile((46.5, 7, np.nan), (5, 1))) is None
 
 
 def test_scale_place_and_up_in_spite_of_outliers() -> None:

@@ -69,6 +69,23 @@ def test_files_that_are_not_read_are_named(tmp_path: Path, caplog, monkeypatch) 
     assert "h.avif" in caplog.text
 
 
+def test_maps_of_blender_and_what_is_not_downloaded(tmp_path: Path, caplog) -> None:
+    """A cloud leaves ``.IMG_1.jpg.icloud`` of a photograph that is not on the disk: it was missing without a word."""
+    for name in ("r_0.png", "r_0_depth_0001.png", "r_0_normal.png", "r_normal_0002.png"):
+        put(tmp_path / name)
+    for name in (".r_1.png.icloud", "r_2.png.crdownload"):
+        (tmp_path / name).write_bytes(b"1")
+    assert [picture.name for picture in find_pictures(tmp_path)] == ["r_0", "r_normal_0002"]
+    assert "not downloaded completely: .r_1.png.icloud, r_2.png.crdownload" in caplog.text
+    assert "not read: r_0_depth_0001.png, r_0_normal.png (" in caplog.text
+
+
+def test_archives_are_to_be_unpacked(tmp_path: Path) -> None:
+    (tmp_path / "photos.zip").write_bytes(b"PK")
+    with pytest.raises(ValueError, match=r"photos\.zip is an archive: unpack it"):
+        find_pictures(tmp_path / "photos.zip")
+
+
 @pytest.mark.skipif(not features.check("avif"), reason="this Pillow reads no AVIF")
 def test_avif(tmp_path: Path) -> None:
     put(tmp_path / "a.avif")

@@ -204,11 +204,13 @@ def test_files_that_may_have_cameras_are_named_if_they_are_not_read(folder: Path
     names = ("a_calibrated_external_camera_parameters.txt", "export.csv", "notes.txt", "sfm_data.json")
     for name in names:
         (folder / name).write_text("Name,X,Y,Z")
+    (folder / "008.xmp").write_text('<x xmlns:xcr="http://www.capturingreality.com/ns/xcr/1.1#"><xcr:Rotation/></x>')
+    (folder / "009.xmp").write_text('<x xmlns:crs="http://ns.adobe.com/camera-raw-settings/1.0/"/>')
     monkeypatch.setattr("vg2gt.inputs.cameras.find_cameras", lambda pictures, *_: pictures)
     for poses, said in (("sfm", False), ("auto", True)):
         with pictures_for(model, folder, poses) as pictures:  # type: ignore[arg-type]
             assert len(pictures) == 4
-        named = ", ".join(str(folder / name) for name in names if name != "notes.txt")
+        named = ", ".join(str(folder / name) for name in ("008.xmp", *names) if name != "notes.txt")
         assert (f"not read as cameras: {named} (" in caplog.text) == said
 
 

@@ -272,6 +272,14 @@ def test_umlauts_as_macos_writes_them(put, folder: Path, frames) -> None:
     ]
 
 
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_texts_as_windows_writes_them(encoding: str, folder: Path, recording: Path, frames) -> None:
+    put_poses(folder, recording)
+    for name in ("poses.txt", "K.txt"):
+        (folder / name).write_bytes((folder / name).read_text().replace("\n", "\r\n").encode(encoding))
+    check_cameras(given_pictures(folder), frames, "poses")
+
+
 @pytest.mark.parametrize("put", [put_transforms, put_cameras])
 def test_paths_from_windows(put, folder: Path, frames) -> None:
     """Backslashes; those of masks and depth were not found, only those of images."""

@@ -81,6 +81,36 @@ def test_what_shows_nothing_is_left_out_by_name(tmp_path: Path, caplog) -> None:
     assert "text.jpg cannot be read" in caplog.text
 
 
+def test_grey_among_coloured_and_one_photograph_in_two_formats_are_left_out(tmp_path: Path, caplog) -> None:
+    """Bands of thermal and multispectral cameras next to the photographs; IMG_1.HEIC and IMG_1.JPG."""
+    tint = np.array([1.0, 0.7, 0.4])
+    for number in range(5):
+        pixels = (scenery(number) * (1 if number == 3 else tint)).astype(np.uint8)
+        Image.fromarray(pixels).save(tmp_path / f"{number}.jpg", quality=92)
+    Image.open(tmp_path / "0.jpg").save(tmp_path / "0.png")
+    Image.fromarray((scenery(9) * tint).astype(np.uint8)).save(tmp_path / "1.png")  # another one
+    found = usable_pictures(find_pictures(tmp_path), Monitor())
+    assert [picture.path.name for picture in found if picture.path] == ["0.jpg", "1.jpg", "1.png", "2.jpg", "4.jpg"]
+    assert "3 is without colour" in caplog.text
+    assert "is 0.jpg in another format" in caplog.text
+
+
+def test_stereo_pairs_are_said(tmp_path: Path, caplog) -> None:
+    """A frame of a stereo camera was taken for one wide photograph. Wide photographs, also of one colour, are not."""
+    for number in range(3):
+        wide = scenery(number, (90, 240))
+        pair = np.concatenate((wide[:, 8:136], wide[:, :128])[:: 1 - 2 * (number % 2)], 1)
+        for name, pixels in (("pair", pair), ("wide", wide), ("flat", np.full_like(wide, 90))):
+            (tmp_path / name).mkdir(exist_ok=True)
+            Image.fromarray(pixels).save(tmp_path / name / f"{number}.png")
+    usable_pictures(find_pictures(tmp_path / "wide"), Monitor())
+    with pytest.raises(DataError, match="of one colour"):
+        usable_pictures(find_pictures(tmp_path / "flat"), Monitor())
+    assert not caplog.text
+    assert len(usable_pictures(find_pictures(tmp_path / "pair"), Monitor())) == 3
+    assert "3 images show the same twice, side by side" in caplog.text
+
+
 def test_dark_and_bright_scenes_and_bare_walls_are_kept(tmp_path: Path, caplog) -> None:
     """Night, a white table, an object on black, a wall among textured views."""
     wall = 180 + np.linspace(0, 20, SHAPE[1])[None, :, None] + np.random.default_rng(0).normal(size=(*SHAPE, 3))

@@ -13,6 +13,7 @@ from PIL import Image
 from tests.reconstruction.conftest import run
 from vg2gt import io
 from vg2gt.geometry.cameras import project
+from vg2gt.io.files import portable
 from vg2gt.outputs.output_names import OUTPUTS
 from vg2gt.outputs.outputs import write_outputs
 from vg2gt.reconstruction.pipeline import reconstruct_with
@@ -164,6 +165,28 @@ def test_files_do_not_replace_each_other_where_case_is_ignored(folder: Path, fra
         pose = poses.pop((exported / "images" / image.name).read_bytes())
         np.testing.assert_allclose(io.colmap_pose(image), pose, atol=1e-4)
     assert not poses
+
+
+def test_names_that_windows_refuses_are_changed(folder: Path, frames, model, tmp_path: Path, caplog) -> None:
+    """``photos\\1.png`` is what Linux makes of some ZIP files from Windows."""
+    names, odd = ["aux.png", "2024-05-01 12:30.png", "photos\\1.png", "con/NUL.tar.png"], tmp_path / "odd"
+    for number, name in enumerate(names):
+        (odd / "images" / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(folder / "images" / f"{8 + number:03d}.png", odd / "images" / name)
+    cameras = Cameras(frames.world_to_camera[None].double(), frames.intrinsics[None].double(), (84, 112))
+    io.write_colmap(odd / "sparse" / "0", io.colmap_from_views(cameras, names))
+    reconstruct_with(model, odd).save(tmp_path / "out", ["colmap", "nerfstudio", "color.png"])
+    images = io.colmap_images(io.read_colmap(tmp_path / "out" / "colmap" / "sparse" / "0"))
+    written = ["_aux.png", "2024-05-01 12_30.png", "photos_1.png", "_con/_NUL.tar.png"]
+    assert {image.name for image in images} == set(written)
+    for name, own in zip(written, names, strict=True):
+        for kind in ("colmap", "nerfstudio"):
+            assert (tmp_path / "out" / kind / "images" / name).read_bytes() == (odd / "images" / own).read_bytes()
+    assert {path.name for path in (tmp_path / "out" / "color").iterdir()} == {Path(name).name for name in written}
+    assert "4 names are not allowed on Windows and are changed" in caplog.text
+    assert [portable(name) for name in ("a. ", "x.", "com1", "com10.jpg", "console.jpg")] == [
+        "a._", "x_", "_com1", "com10.jpg", "console.jpg"
+    ]  # fmt: skip
 
 
 def test_a_full_disk_is_noticed_before_any_work(folder: Path, tmp_path: Path, monkeypatch) -> None:

@@ -1,11 +1,15 @@
 """``--object``: what all cameras look at stays, what surrounds it goes."""
 
 import math
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+import trimesh
 
+from vg2gt.outputs.outputs import write_outputs
 from vg2gt.reconstruction.camera_path import look_at
 from vg2gt.reconstruction.cutout import cut_to_object
 from vg2gt.reconstruction.scene import Scene
@@ -64,6 +68,25 @@ def test_only_the_object_stays(target: list[float]) -> None:
     assert seen.any()
     assert (after.depth[seen] < 3.9).all()  # the wall's depth has gone with it
     assert (before.depth > 6).any()
+
+
+def test_the_mesh_of_an_object_is_closed(tmp_path: Path) -> None:
+    """Its lower side, which no camera sees, too."""
+    target = np.array([5.0, -2, 9])
+    whole = scene(target.tolist(), orbit(target))
+    write_outputs(cut_to_object(whole), tmp_path / "object", ["mesh.ply"], mesh_voxel=0.03)
+    write_outputs(replace(cut_to_object(whole), is_object=False), tmp_path / "open", ["mesh.ply"], mesh_voxel=0.03)
+    surface = trimesh.load_mesh(tmp_path / "open" / "mesh.ply")
+    assert not surface.is_watertight
+    radius = float(np.median(np.linalg.norm(surface.vertices - target, axis=1)))  # Gaussians are thick
+    assert 0.4 < radius < 0.52
+    mesh = trimesh.load_mesh(tmp_path / "object" / "mesh.ply")
+    assert mesh.is_watertight
+    assert mesh.is_winding_consistent
+    assert len(mesh.split()) == 1
+    assert mesh.volume == pytest.approx(4 / 3 * math.pi * radius**3, rel=0.05)
+    distance = np.linalg.norm(mesh.vertices - target, axis=1)
+    assert np.abs(distance / radius - 1).max() < 0.1
 
 
 def test_a_room_is_no_object() -> None:

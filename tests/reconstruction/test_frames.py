@@ -90,6 +90,15 @@ def test_gps_gives_metres_and_up(folder: Path, frames, tmp_path: Path, monkeypat
     np.testing.assert_allclose(found - found[0], known - known[0], atol=0.02 * np.ptp(known))
 
 
+def test_gps_without_altitude_is_said(folder: Path, frames, model, caplog) -> None:
+    put_colmap(folder, frames)
+    for file in sorted((folder / "images").iterdir())[:3]:
+        with_gps(file, (46.84, -91.99, np.nan))
+    assert reconstruct_with(model, folder).metres_per_unit is None
+    assert "the GPS positions of 3 photographs have no altitude" in caplog.text
+    assert "too few or too coarse" in caplog.text
+
+
 def test_map_coordinates_keep_their_digits(folder: Path, frames, model, caplog) -> None:
     """GPS. The shift is left out of what single precision has to hold, and said."""
     shift = np.array([4_400_000.0, 600_000.0, 300.0])

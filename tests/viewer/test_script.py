@@ -24,13 +24,48 @@ globalThis.Option = class {};
 """
 
 
-def run(code: str) -> Any:
-    """Runs code after the page's scripts, and returns the JSON that its ``answer`` is."""
+STARTED = """
+const count = 200000, means = new Float32Array(3 * count), geometry = new Float32Array(12 * count), drawn = [];
+for (let i = 0; i < count; i++) {
+  means[3 * i + 2] = 5;
+  geometry.set([0, 0, 5, 1, 1, 0, 0, 0, 1 + i / count, 1, 1, 0], 12 * i);
+}
+inflate = async () => null;
+decodeGaussians = () => ({ means, harmonics: null, geometry });
+Renderer = class {
+  setGaussians() {} setFrusta() {} resize() {} draw() {}
+  setOrder(order) { drawn.push(order.length); }
+};
+let move;
+connect = ({ changed, setCamera }) => { move = changed; return setCamera; };
+connectTools = () => {};
+pivotDepth = () => 1;
+for (const id of ["view", "cameras", "scene", "gaussians"]) element(id).remove = () => {};
+made.scene.textContent = JSON.stringify({
+  gaussians: { degree: 0 }, settings: { near: 0.1 }, cameras: [], frustum_depth: 1, initial: RECORD,
+});
+made.view.clientWidth = made.view.clientHeight = 10;
+window.devicePixelRatio = 1;
+globalThis.requestAnimationFrame = (action) => setTimeout(action, 100);  // a slow device
+const wait = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
+(async () => {
+  await start();
+  for (let i = 0; i < 10; i++) { move(); await wait(50); }
+  const least = Math.min(...drawn);
+  for (let i = 0; i < 100 && drawn.at(-1) < count; i++) await wait(100);
+  console.log(JSON.stringify([drawn[0], least, drawn.at(-1)]));
+  process.exit();
+})();
+"""
+
+
+def run(code: str, answers: bool = True) -> Any:
+    """Runs code after the page's scripts, and returns the JSON that its ``answer`` is, or that it prints."""
     node = shutil.which("node")
     if node is None:
         pytest.skip("needs node: apt-get install nodejs")
     script = "\n".join((STATIC / name).read_text() for name in SCRIPTS)
-    program = f"{DOM}{script}\nlet answer;\n{code}\nconsole.log(JSON.stringify(answer));"
+    program = f"{DOM}{script}\nlet answer;\n{code}\n{'console.log(JSON.stringify(answer));' * answers}"
     done = subprocess.run([node, "-"], input=program, capture_output=True, text=True, timeout=60, check=False)
     assert not done.returncode, done.stderr
     return json.loads(done.stdout)
@@ -130,3 +165,39 @@ def test_measuring_cropping_and_views_to_keep() -> None:
     for field in ("width", "height", "intrinsics", "world_to_camera"):
         assert np.allclose(answer["back"][field], record[field])
     assert np.allclose(answer["axes"][1], [-1, 0, 0])  # down; the camera looks along z
+
+
+def test_fewer_gaussians_are_drawn_while_a_large_scene_moves() -> None:
+    """Slow frames halve them at most, fast ones bring them back; those that cover most are kept, in their order."""
+    answer = run("""
+        const count = 200000, geometry = new Float32Array(12 * count), means = new Float32Array(3 * count);
+        for (let i = 0; i < count; i++) {
+          geometry.set([0, 0, 1 + i / count, i % 2 ? 0.5 : 1, 1, 0, 0, 0, 0.001, 1 + i % 4, 1, 0], 12 * i);
+          means[3 * i + 2] = 1 + i / count;
+        }
+        const weights = weightsOf(geometry), detail = new Detail(weights), seen = [detail.least()];
+        const sort = makeDepthSorter(means, weights), shown = [];
+        for (const duration of [66, 10, 100, 1000, 1000]) {
+          detail.adapt(duration);
+          shown.push(detail.most);
+          seen.push(sort([0, 0, 1, 0], 0.1, null, detail.least()).length);
+        }
+        const kept = [...sort([0, 0, 1, 0], 0.1, null, detail.least())];
+        for (let i = 0; i < 20; i++) detail.adapt(16);
+        const sorted = kept.every((value, k) => !k || value < kept[k - 1]);
+        const kinds = [...new Set(kept.map((i) => i % 4))], first = [...weights.slice(0, 4)];
+        answer = { seen, shown, sorted, all: detail.least(), kinds, first };
+        """)
+    assert answer["first"] == [1, 1, 3, 2]
+    assert answer["shown"] == pytest.approx([100_000, 110_000, 55_000, 50_000, 50_000])
+    assert answer["seen"] == [0, 100_000, 200_000, 100_000, 50_000, 50_000]  # equal weights stay together
+    assert answer["kinds"] == [2]
+    assert answer["sorted"]
+    assert answer["all"] == 0
+
+
+def test_what_was_left_out_is_drawn_once_the_view_rests() -> None:
+    record = json.dumps(ball_before_a_wall().initial().fields())
+    first, least, last = run(STARTED.replace("RECORD", record), answers=False)
+    assert (first, last) == (200_000, 200_000)
+    assert least <= 100_000

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import glob
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -18,6 +19,7 @@ from vg2gt.cli import folders
 from vg2gt.cli.commands import COMMANDS, DATA_COMMANDS
 from vg2gt.cli.errors import errors_in_one_line
 from vg2gt.config import config_dir
+from vg2gt.io.files import by_number
 
 if TYPE_CHECKING:
     from vg2gt.viewer.live import LiveView
@@ -96,6 +98,16 @@ def separate(argv: Sequence[str] | None) -> tuple[list[str], list[str]]:
     given = sys.argv[1:] if argv is None else list(argv)
     overrides = [argument for argument in given if OVERRIDE.match(argument) and not Path(argument).exists()]
     return [argument for argument in given if argument not in overrides], overrides
+
+
+def without_patterns(paths: Sequence[str]) -> list[str]:
+    """Returns paths; patterns such as ``photos/*.jpg``, which shells of Windows do not expand, become files."""
+    found: list[str] = []
+    for path in paths:
+        is_pattern = glob.has_magic(path) and not Path(path).expanduser().exists()
+        matches = sorted(glob.glob(str(Path(path).expanduser())), key=by_number) if is_pattern else []
+        found += matches or [path]
+    return found
 
 
 def list_of_names(text: str) -> list[str]:

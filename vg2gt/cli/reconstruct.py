@@ -19,6 +19,7 @@ from vg2gt.cli.arguments import (
     listing,
     separate,
     watching,
+    without_patterns,
 )
 from vg2gt.cli.errors import errors_in_one_line
 from vg2gt.outputs.output_names import DEFAULT, LARGE, OUTPUTS, PREDICTED, TILES
@@ -77,6 +78,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     add_common_flags(arguments, DEFAULT)
     given, overrides = separate(argv)
     options = arguments.parse_args(given)
+    options.images = without_patterns(options.images)
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     with errors_in_one_line():
         if options.each:

@@ -14,6 +14,7 @@ import numpy as np
 
 from vg2gt.data.base import DataError
 from vg2gt.data.sources.masks import AmbiguousMaskError
+from vg2gt.inputs.camera_check import check_cameras
 from vg2gt.inputs.distinct import without_copies
 from vg2gt.inputs.foreign import unread_camera_files
 from vg2gt.inputs.given_cameras import LAYOUTS, describe, given_pictures
@@ -62,7 +63,8 @@ def pictures_for(
     Raises:
         FileNotFoundError: if a path does not exist.
         ImportError: if structure from motion needs pycolmap and it is not installed.
-        ValueError: if there are no pictures, the requested cameras are not available, or the backbone takes none.
+        ValueError: if there are no pictures, the requested cameras are not available or contradict the images, or the
+            backbone takes none.
     """
     backend = model.backend
     if poses not in get_args(Poses):
@@ -82,9 +84,11 @@ def pictures_for(
     if poses != "sfm":
         given = _given_pictures(images, max_images, backend.needs_depth, poses)
     if given is not None:
+        usable = usable_pictures(without_copies(given), monitor)
         if not backend.needs_depth:
-            _check_places(given)
-        yield usable_pictures(without_copies(given), monitor)
+            _check_places(usable)
+            check_cameras(usable, monitor, insisted=poses == "given")
+        yield usable
         return
     if backend.needs_depth:
         raise ValueError(_no_depth(backend.name, images))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -26,7 +27,8 @@ _OTHER_SUFFIXES = (
     *(".360", ".3gp", ".flv", ".insv", ".lrv", ".m2ts", ".mpeg", ".mpg", ".mts", ".mxf", ".ogv", ".ts", ".wmv"),
     *(R3D, *VIDEO_SUFFIXES),
 )
-_DEPTH = ("_depth", "-depth", ".depth")  # in the names of depth images next to photographs
+_NOT_THERE = (".crdownload", ".download", ".icloud", ".part", ".partial")  # of files that are not downloaded yet
+_DEPTH = ("_depth", "-depth", ".depth", "_normal", "_normals")  # in the names of other images next to photographs
 _RESULTS = ("report.json", "sfm.json", "scene.ply")  # in folders that vg2gt has written
 
 
@@ -85,9 +87,15 @@ def _can_read(path: Path) -> bool:
     return path.exists() and (path.suffix.lower() != ".avif" or bool(features.check("avif")))
 
 
+def _is_map(file: Path) -> bool:
+    """Returns whether a file is the depth or normals of an image next to it; Blender numbers them, as ``_0001``."""
+    unnumbered = file.with_name(re.sub(r"_\d{4}$", "", file.stem) + file.suffix)
+    return image_beside(unnumbered, _DEPTH) is not None
+
+
 def _photos(folder: Path, without: list[Path]) -> list[Path]:
     found = [file for file in _walk(folder, without) if is_photo(file) and _can_read(file)]
-    return [file for file in found if image_of_mask(file) is None and image_beside(file, _DEPTH) is None]
+    return [file for file in found if image_of_mask(file) is None and not _is_map(file)]
 
 
 def _others(folder: Path) -> str:
@@ -100,14 +108,16 @@ def _others(folder: Path) -> str:
             not file.name.startswith(".")
             and (file.suffix.lower() in _OTHER_SUFFIXES or (is_photo(file) and not _can_read(file)))
         )
-        or image_beside(file, _DEPTH) is not None
+        or _is_map(file)
     ]
+    waiting = [str(file.relative_to(folder)) for file in _walk(folder, known) if file.suffix.lower() in _NOT_THERE]
     links = [path for path in folder.iterdir() if path.is_symlink() and path.is_dir() and path not in known]
     files += [f"{path.name}/ (a link)" for path in links if not OTHER_FOLDERS.fullmatch(path.name)]
+    said = f"; not downloaded completely: {some(sorted(waiting, key=by_number))}" if waiting else ""
     if not files:
-        return ""
+        return said
     named = some(sorted(files, key=by_number))
-    return f"; not read: {named} (save photographs as JPEG or PNG, give a video by itself)"
+    return f"{said}; not read: {named} (save photographs as JPEG or PNG, give a video by itself)"
 
 
 def _is_skipped(folder: Path) -> bool:

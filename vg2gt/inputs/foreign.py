@@ -32,7 +32,19 @@ def camera_files_in(folder: Path) -> list[Path]:
 def unread_camera_files(folder: Path) -> list[Path]:
     """Returns files in a folder that may have cameras, by their names, but are of no kind that is read."""
     files = [file for file in sorted(folder.iterdir()) if file.is_file() and not is_camera_file(file)]
-    return [file for file in files if file.suffix.lower() in _MAYBE or any(map(file.name.endswith, _NAMED))]
+    return [
+        file
+        for file in files
+        if file.suffix.lower() in _MAYBE or any(map(file.name.endswith, _NAMED)) or _is_sidecar_of_reality_scan(file)
+    ]
+
+
+def _is_sidecar_of_reality_scan(file: Path) -> bool:
+    """Returns whether an XMP file has the pose of its photograph; those of photo editors have none."""
+    if file.suffix.lower() != ".xmp":
+        return False
+    with file.open("rb") as opened:
+        return b"capturingreality.com/ns/xcr" in opened.read(4096)
 
 
 def matched(cameras: Sequence[ForeignCamera], files: Sequence[Path]) -> dict[Path, ForeignCamera]:

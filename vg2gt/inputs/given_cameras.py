@@ -89,8 +89,12 @@ def given_pictures(images: ImagesLike, max_images: int | None = None, depth: boo
     return with_unique_names(evenly(found, max_images))
 
 
-def recording_pictures(source: FileSource) -> list[Picture]:
+def recording_pictures(source: FileSource, with_tests: bool = False) -> list[Picture]:
     """Returns the pictures of a source's only scene, with their cameras and depth, each at its own size.
+
+    Args:
+        source: the source.
+        with_tests: also return the test frames of Blender's sets.
 
     Raises:
         ValueError: if the source has several scenes.
@@ -130,7 +134,7 @@ def recording_pictures(source: FileSource) -> list[Picture]:
             lens=index.lens(row),
         )
 
-    tests = set(source.held_out(scene)) if isinstance(source, Nerfstudio) else set()
+    tests = set(source.held_out(scene)) if isinstance(source, Nerfstudio) and not with_tests else set()
     return [picture(frame) for frame in source.frames(scene) if frame not in tests]
 
 
@@ -194,7 +198,7 @@ def _at(place: Path, images: str, depth: bool, above: bool) -> tuple[list[Pictur
     source = _source(place, images, depth)
     if source is None or (above and isinstance(source, RGBDFolder) and len(source.scenes) > 1):
         return (None if depth else _from_programs(place, place / images, above)), set()
-    pictures = recording_pictures(source)
+    pictures = recording_pictures(source, with_tests=above)  # of ``test/`` if that is asked for
     index = source.scene_index(source.scenes[0])
     return pictures, {file.resolve() for file in (*index.color, *index.depth)}
 

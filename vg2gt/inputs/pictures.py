@@ -53,6 +53,7 @@ ImagesLike: TypeAlias = "str | Path | Image.Image | NDArray[Any] | Tensor | Sequ
 T = TypeVar("T")
 
 _OF_SEVERAL = (".tif", ".tiff", ".png", ".webp", ".avif")  # files of pages or animations; MPO's others are previews
+_ARCHIVES = (".7z", ".gz", ".rar", ".tar", ".tgz", ".zip")
 _HOLDS_PICTURES = (*PHOTO_SUFFIXES, R3D)
 VIDEO_FRAMES = 32  # frames taken from a video by default
 MOST_FRAMES = 1000  # frames taken from a video at most
@@ -193,10 +194,13 @@ def existing_path(item: str | Path) -> Path:
 
     Raises:
         FileNotFoundError: if it does not exist.
+        ValueError: if it is an archive.
     """
     path = Path(item).expanduser()
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist (working directory: {Path.cwd()})")
+    if path.suffix.lower() in _ARCHIVES and path.is_file():
+        raise ValueError(f"{path} is an archive: unpack it and give the folder of the images")
     return path
 
 

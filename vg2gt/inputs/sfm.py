@@ -169,8 +169,9 @@ def _solve(pictures: Sequence[Picture], folder: Path, key: str, monitor: Monitor
         with monitor.stage("read photographs", len(pictures)) as advance:
             lenses = _stage(pictures, work, advance)
         names = sorted(name for members in lenses.values() for name in members)
-        _find_features(work, lenses, names, monitor)
-        _match(work, names, monitor)
+        sides = [max(height, width) for (height, width, _), members in lenses.items() for _ in members]
+        find_features(work, lenses, names, feature_settings(sides), monitor)
+        match_features(work, names, monitor)
         matches = Matches.read(work / "database.db")
         check_motion(matches)
         models = _map(work, len(names), monitor)
@@ -243,9 +244,22 @@ def feature_settings(sides: Sequence[int]) -> tuple[int, int, int]:
     return (IMAGE_SIDE, features, 0) if min(sides) >= LARGE_SIDE else (side, features, -1)
 
 
-def _find_features(
-    work: Path, lenses: dict[tuple[int, int, float], list[str]], names: Sequence[str], monitor: Monitor
+def find_features(
+    work: Path,
+    lenses: dict[tuple[int, int, float], list[str]],
+    names: Sequence[str],
+    settings: tuple[int, int, int],
+    monitor: Monitor,
 ) -> None:
+    """Finds the SIFT features of ``work/images`` and writes them to ``work/database.db``.
+
+    Args:
+        work: folder; images in ``masks/`` restrict the features.
+        lenses: names of the images by height, width and focal length in pixels (0: unknown).
+        names: names of all images.
+        settings: see :func:`feature_settings`.
+        monitor: shows the stage.
+    """
     import pycolmap  # pyright: ignore[reportMissingImports]
 
     database, images = work / "database.db", work / "images"
@@ -261,8 +275,6 @@ def _find_features(
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False
     options.num_threads = _threads()
-    sides = [max(height, width) for (height, width, _), members in lenses.items() for _ in members]
-    settings = feature_settings(sides)
     options.max_image_size, options.sift.max_num_features, options.sift.first_octave = settings
     masked = pycolmap.ImageReaderOptions()
     if (work / _MASKS).exists():
@@ -282,8 +294,8 @@ def _find_features(
                 advance()
 
 
-def _match(work: Path, names: Sequence[str], monitor: Monitor) -> None:
-    """Matches all pairs of images, or, if there are many images, likely pairs only."""
+def match_features(work: Path, names: Sequence[str], monitor: Monitor) -> None:
+    """Matches the features of all pairs of images in ``work/database.db``, of likely pairs only if there are many."""
     import pycolmap  # pyright: ignore[reportMissingImports]
 
     database = work / "database.db"

@@ -1,4 +1,4 @@
-"""Leaves out pictures that show nothing (damaged, black, blurred, hidden) and masks the black borders of others.
+"""Leaves out pictures that show nothing (damaged, black, blurred, hidden) or nothing new, and masks black borders.
 
 Undistorted photographs have borders that are black in all images of a size and end abruptly. A dark background does
 neither: its edge differs from image to image.
@@ -7,8 +7,10 @@ neither: its edge differs from image to image.
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -21,6 +23,7 @@ from vg2gt.data.sources.masks import joined_masks, resized_mask
 from vg2gt.data.transforms import to_bytes
 from vg2gt.inputs.damaged import name_left_out, reason_of
 from vg2gt.inputs.pictures import IN_MEMORY, Picture
+from vg2gt.io.errors import some
 from vg2gt.io.images import curvatures
 from vg2gt.monitor import Monitor
 
@@ -31,9 +34,12 @@ _BLACK, _WHITE = 12, 250  # values of 255 up to and from which a pixel shows not
 _NOISE = 4  # pixels over which noise is averaged
 _ALL, _NEARLY_ALL, _USUAL = 0.995, 0.9, 0.5  # shares of such pixels: always, or where most images have fewer than usual
 _FLAT = 1.0  # standard deviation of the brightness of an image that shows nothing
+_GREY, _COLORFUL = 3, 20  # difference of the channels in 99 of 100 pixels: of a grey image, of a coloured one
 _COARSE = (4, 16)  # pixels of structures that blur leaves
 _BLURRED = 0.03  # least detail of 1 pixel in the worst direction, relative to the coarse one and to the images' median
+_SAME = 6.0  # mean difference of 255 of one photograph in two formats
 _SHOWN = 0.001  # share of the pixels that a mask shows at least
+_WIDE, _HALF, _PAIR = 1.7, 32, 0.9  # shape of stereo pairs, pixels of a half, least correlation of the halves
 _FEWEST = 3  # images that are compared with each other
 _BORDER, _LIT = 6, 24  # values of 255 of a border at most, and of the image next to it at least
 _BORDERS = (0.001, 0.6)  # least and largest share of the pixels
@@ -44,12 +50,16 @@ _OFTEN = 0.7  # share of the images, and of the pixels along the border, in whic
 
 @dataclass(frozen=True)
 class _Look:
-    """What a small copy of a picture shows: shares of black and white pixels, spread and detail of the brightness."""
+    """What a small copy of a picture shows: shares of black and white pixels, spread and detail of the brightness,
+    and how much the channels differ.
+    """
 
     black: float
     white: float
     spread: float
     detail: float
+    color: float
+    is_pair: bool
 
 
 class _Borders:
@@ -79,6 +89,27 @@ class _Borders:
         return (~near).astype(np.float32) if len(often) and often.mean() >= _OFTEN else None
 
 
+class _Twins:
+    """Photographs of one name in several formats, such as IMG_1.HEIC and IMG_1.JPG."""
+
+    def __init__(self, pictures: Sequence[Picture]) -> None:
+        files = [each.path.with_suffix("") for each in pictures if each.path is not None]
+        self.seen: dict[Path, list[tuple[str, NDArray[np.uint8]]]] = {
+            name: [] for name, count in Counter(files).items() if count > 1
+        }
+
+    def of(self, picture: Picture, pixels: NDArray[np.uint8]) -> str:
+        """Returns the file name of an earlier photograph that shows the same; empty if there is none."""
+        earlier = self.seen.get(picture.path.with_suffix("")) if picture.path is not None else None
+        if earlier is None or picture.path is None:
+            return ""
+        for name, other in earlier:
+            if other.shape == pixels.shape and np.abs(other.astype(np.float32) - pixels).mean() < _SAME:
+                return name
+        earlier.append((picture.path.name, pixels))
+        return ""
+
+
 def usable_pictures(pictures: Sequence[Picture], monitor: Monitor) -> list[Picture]:
     """Returns the pictures that can be read and show something; those left out are named in a warning.
 
@@ -96,6 +127,7 @@ def usable_pictures(pictures: Sequence[Picture], monitor: Monitor) -> list[Pictu
     looks: dict[str, _Look] = {}
     faults: dict[str, str] = {}
     borders: dict[tuple[int, int], _Borders] = {}
+    twins = _Twins(pictures)
     with monitor.stage("check images", len(pictures)) as advance:
         for picture in pictures:
             try:
@@ -105,11 +137,19 @@ def usable_pictures(pictures: Sequence[Picture], monitor: Monitor) -> list[Pictu
             else:
                 if shown < _SHOWN:
                     faults[picture.name] = "is hidden by its mask (white in masks is what counts)"
+                if other := twins.of(picture, pixels):
+                    faults[picture.name] = f"is {other} in another format"
                 looks[picture.name] = _look(pixels)
                 if _may_have_borders(picture):
                     borders.setdefault(picture.size, _Borders(pixels.shape[:2])).add(pixels.max(2))
             advance()
     faults |= _faults(looks)
+    pairs = [name for name, look in looks.items() if look.is_pair]
+    if 2 * len(pairs) > len(looks):
+        log.warning(
+            "%d images show the same twice, side by side, as stereo cameras and spatial photographs do: cut them into "
+            "their halves, or the scene will be wrong: %s", len(pairs), some(pairs),
+        )  # fmt: skip
     name_left_out(faults, len(pictures))
     masks = {size: mask for size, own in borders.items() if (mask := own.mask()) is not None}
     found = [each for each in pictures if each.name not in faults]
@@ -145,7 +185,22 @@ def _look(pixels: NDArray[np.uint8]) -> _Look:
     fine, *coarse = (curvatures(grey, step) for step in (1, *_COARSE))
     detail = float((fine / np.maximum(np.max(coarse, 0), 1e-6)).min())
     black, white = (smooth.max(2) <= _BLACK).mean(), (smooth.min(2) >= _WHITE).mean()
-    return _Look(float(black), float(white), float(smooth.mean(2).std()), detail)
+    color = float(np.quantile(np.ptp(smooth, axis=2), 0.99))
+    return _Look(float(black), float(white), float(smooth.mean(2).std()), detail, color, _is_stereo_pair(pixels))
+
+
+def _is_stereo_pair(pixels: NDArray[np.uint8]) -> bool:
+    """Returns whether the left and the right half of a wide picture show the same, shifted a little."""
+    height, width = pixels.shape[:2]
+    if width < _WIDE * height:
+        return False
+    small = np.asarray(Image.fromarray(pixels).convert("L").resize((2 * _HALF, _HALF), Image.Resampling.BOX), float)
+    left, right = small[:, :_HALF], small[:, _HALF:]
+    if min(left.std(), right.std()) < _FLAT:
+        return False
+    halves, reach = ((left, right), (right, left)), range(_HALF // 8)  # also of crossed eyes
+    shifts = ((one[:, shift:], other[:, : _HALF - shift]) for one, other in halves for shift in reach)
+    return max(float(np.corrcoef(one.ravel(), other.ravel())[0, 1]) for one, other in shifts) > _PAIR
 
 
 def _faults(looks: dict[str, _Look]) -> dict[str, str]:
@@ -153,8 +208,9 @@ def _faults(looks: dict[str, _Look]) -> dict[str, str]:
     if not looks:
         return {}
     several = len(looks) >= _FEWEST
-    black, white, detail = (
-        float(np.median([getattr(look, name) for look in looks.values()])) for name in ("black", "white", "detail")
+    black, white, detail, color = (
+        float(np.median([getattr(look, name) for look in looks.values()]))
+        for name in ("black", "white", "detail", "color")
     )
 
     def fault(look: _Look) -> str:
@@ -164,6 +220,8 @@ def _faults(looks: dict[str, _Look]) -> dict[str, str]:
             return "is over-exposed"
         if look.spread < _FLAT:
             return "is of one colour"
+        if several and look.color <= _GREY and color >= _COLORFUL:
+            return "is without colour (of a thermal or infrared camera?)"
         return "is blurred" if several and look.detail < _BLURRED * detail else ""
 
     return {name: found for name, look in looks.items() if (found := fault(look))}

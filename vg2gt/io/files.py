@@ -21,6 +21,9 @@ from vg2gt.io.errors import FormatError
 log = logging.getLogger(__name__)
 
 _unwritable: set[Path] = set()
+# What Windows does not allow in names of files.
+_REFUSED = re.compile(r'[<>:"\\|?*\x00-\x1f]')
+_DEVICE = re.compile(r"(con|prn|aux|nul|(com|lpt)[1-9¹²³]) *(\..*)?", re.IGNORECASE)
 
 
 @contextmanager
@@ -50,6 +53,18 @@ def replacing(path: str | Path, durable: bool = False) -> Iterator[Path]:
     finally:
         with suppress(OSError):  # on a failing disk; the first error says more
             temporary.unlink(missing_ok=True)
+
+
+def portable(name: str) -> str:
+    """Returns a relative path that all systems allow: without names of devices and characters that Windows refuses."""
+    return "/".join(_portable_part(part) for part in name.split("/"))
+
+
+def _portable_part(part: str) -> str:
+    part = _REFUSED.sub("_", part)
+    if part not in (".", "..") and part[-1:] in (".", " "):
+        part = f"{part[:-1]}_"
+    return f"_{part}" if _DEVICE.fullmatch(part) else part
 
 
 def _temporary_name(path: Path) -> Path:

@@ -93,7 +93,8 @@ def gps_position(path: Path) -> tuple[float, float, float] | None:
     """Returns where a photograph was taken, from its EXIF data.
 
     Returns:
-        Latitude and longitude in degrees (north and east are positive) and altitude in metres; None if any is unknown.
+        Latitude and longitude in degrees (north and east are positive) and altitude in metres, NaN if that is unknown;
+        None if the others are.
     """
     tags = ExifTags.GPS
     try:
@@ -107,11 +108,11 @@ def gps_position(path: Path) -> tuple[float, float, float] | None:
             )
         )
         is_below = gps.get(tags.GPSAltitudeRef, b"\0") in (b"\1", 1, 3)
-        found = (latitude, longitude, float(gps[tags.GPSAltitude]) * (-1 if is_below else 1))
+        altitude = float(gps.get(tags.GPSAltitude, math.nan)) * (-1 if is_below else 1)
     except Exception:  # damaged EXIF data raise various errors
         return None
-    is_sound = abs(found[0]) <= 90 and abs(found[1]) <= 180 and all(map(math.isfinite, found))
-    return found if is_sound and any(found[:2]) else None  # 0, 0 stands for no position
+    is_sound = abs(latitude) <= 90 and abs(longitude) <= 180 and not math.isinf(altitude)
+    return (latitude, longitude, altitude) if is_sound and (latitude or longitude) else None  # 0, 0: no position
 
 
 def _letter(reference: str | bytes) -> str:

@@ -85,6 +85,17 @@ def fuse_depth(depth: Tensor, cameras: Cameras, colors: Tensor, *, voxel_size: f
     return _surface(keys, values.reshape(-1, 4)[seen][order], voxel_size)
 
 
+def surface_of(index: Tensor, values: Tensor, voxel_size: float) -> Mesh:
+    """Returns the zero level set of voxels, as :func:`fuse_depth` does.
+
+    Args:
+        index: ``[N, 3]`` int64 voxels in lexicographic order; the centre of voxel i is at ``(i + 1/2) * voxel_size``.
+        values: ``[N, 4]`` float32 signed distance, negative inside, and colour in [0, 1].
+        voxel_size: edge length of a voxel in scene units.
+    """
+    return _surface(_pack(index), values, voxel_size)
+
+
 def write_mesh(path: str | Path, mesh: Mesh) -> Path:
     """Writes a mesh with trimesh, atomically, in our world frame, ``.glb`` with y up; the suffix selects the format.
 

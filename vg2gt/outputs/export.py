@@ -15,7 +15,8 @@ import torch
 from numpy.typing import NDArray
 
 from vg2gt.geometry.cameras import project
-from vg2gt.io.files import write_bytes
+from vg2gt.io.errors import some
+from vg2gt.io.files import portable, write_bytes
 from vg2gt.io.image_files import image_size, orientation
 from vg2gt.io.images import encode_image, to_pixels
 from vg2gt.types import Cameras
@@ -101,9 +102,12 @@ def exported_views(scene: Scene) -> _ExportedViews:
         log.warning("photographs of a scene read from a folder are not known: images are exported at the working size")
     shown = [camera.photo or camera for camera in named]
     sizes = tuple((each.height, each.width) for each in shown)
-    names = _with_folders([each.name for each in shown], scene.pictures if named[0].photo else ())
+    own = _with_folders([each.name for each in shown], scene.pictures if named[0].photo else ())
+    names = [portable(name) for name in own]
     if len({name.lower() for name in names}) < len(names):
-        names = [f"{camera.name[:-4]}{Path(name).suffix}" for camera, name in zip(named, names, strict=True)]
+        names = [portable(f"{camera.name[:-4]}{Path(name).suffix}") for camera, name in zip(named, own, strict=True)]
+    elif changed := [f"{name} ({new})" for name, new in zip(own, names, strict=True) if name != new]:
+        log.warning("%d names are not allowed on Windows and are changed: %s", len(changed), some(changed))
     cameras = Cameras(poses[None], torch.from_numpy(np.stack([each.intrinsics for each in shown]))[None], sizes[0])
     return _ExportedViews(cameras, sizes, tuple(names), scene.pictures if named[0].photo else (None,) * len(named))
 

@@ -33,8 +33,9 @@ from vg2gt.io import (
     write_tiles,
     write_transforms,
 )
-from vg2gt.io.files import whole_folder, write_bytes, write_json
+from vg2gt.io.files import portable, whole_folder, write_bytes, write_json
 from vg2gt.io.images import colorize_depth, colorize_normals, grid, to_pixels, write_png
+from vg2gt.io.solid import fuse_solid
 from vg2gt.io.video import video_writer
 from vg2gt.monitor import Monitor
 from vg2gt.outputs.export import exported_views
@@ -203,7 +204,7 @@ def map_folder(folder: Path, output: str) -> Iterator[AddView]:
 
         def add(view: RenderedView) -> None:
             """Writes the map of one view."""
-            name = view_stem(view.camera.name)
+            name = portable(view_stem(view.camera.name))
             target = staged / f"{name}{suffix}"
             if not target.resolve().is_relative_to(staged.resolve()):
                 raise ValueError(f"view name {view.camera.name!r} leads outside the output folder; rename it")
@@ -243,7 +244,7 @@ def feed(views: Iterable[RenderedView], sinks: Sequence[Sink], advance: Callable
 def _mesh_fusion(scene: Scene, paths: Sequence[Path], voxel_size: float | None) -> Iterator[AddView]:
     """Collects the rendered depth and colour of the views, fuses them into a mesh and writes it to the paths.
 
-    Rendered surfaces that no view has measured are left out.
+    Rendered surfaces that no view has measured are left out. The mesh of an object is closed.
 
     Raises:
         ValueError: if no view has rendered depth.
@@ -254,13 +255,20 @@ def _mesh_fusion(scene: Scene, paths: Sequence[Path], voxel_size: float | None) 
     if not (depth > 0).any():
         raise ValueError("cannot create a mesh: no view has rendered depth; remove mesh from the outputs (--save)")
     median = float(depth[depth > 0].median())
+    empty = depth == 0
     depth = torch.where(depth < _MESH_DEPTHS * median, depth, 0)
     if scene.support is not None:
         points = unproject(depth[None], scene.cameras.to("cpu"))[0]
         status = [point_support(view.flatten(0, 1), scene.depth, scene.cameras.to("cpu"))[0] for view in points]
         depth = torch.where(torch.stack(status).view_as(depth) >= Status.SINGLE, depth, 0)
     focal = float(scene.cameras.intrinsics[..., [0, 1], [0, 1]].mean())
-    mesh = fuse_depth(depth, scene.cameras, colors, voxel_size=voxel_size or MESH_PIXELS * median / focal)
+    voxel_size = voxel_size or MESH_PIXELS * median / focal
+    if scene.is_object:
+        means = scene.gaussians.means.detach().cpu()
+        bounds = (means.amin(0), means.amax(0))
+        mesh = fuse_solid(depth, empty, scene.cameras, colors, bounds, voxel_size)
+    else:
+        mesh = fuse_depth(depth, scene.cameras, colors, voxel_size=voxel_size)
     for path in paths:
         write_mesh(path, mesh)
 

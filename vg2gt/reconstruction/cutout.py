@@ -28,7 +28,8 @@ def cut_to_object(scene: Scene) -> Scene:
     """Returns a scene without what is not part of the object in the middle of its views.
 
     The middle is the median of what is in the middle of the images. What almost all cameras see around it, nearer to it
-    than they are, and connected, is the object; floating debris and surroundings go, and so does their depth.
+    than they are, and connected, is the object; floating debris and surroundings go, and so does their depth. Meshes of
+    it are closed (:func:`vg2gt.io.solid.fuse_solid`).
 
     Raises:
         ValueError: if the cameras do not look at one place.
@@ -66,7 +67,7 @@ def cut_to_object(scene: Scene) -> Scene:
         seen = own > 0
         own[seen] *= belongs(unproject(own[None, None], cameras.select(slice(view, view + 1)))[0, 0][seen])
     rows = (inside & belongs(means)).to(scene.gaussians.means.device)
-    return replace(scene, gaussians=scene.gaussians.select(rows), depth=depth)
+    return replace(scene, gaussians=scene.gaussians.select(rows), depth=depth, is_object=True)
 
 
 def _cells(points: Tensor, low: NDArray[np.float64], step: float) -> NDArray[np.int64]:

@@ -164,6 +164,8 @@ def _place(cameras: Cameras, frame: SceneFrame, pictures: Sequence[Picture]) -> 
     if not any(found):
         return None
     positions = np.array([(np.nan,) * 3 if each is None else each for each in found])
+    if no_altitude := int(np.isfinite(positions[:, 0]).sum() - np.isfinite(positions).all(1).sum()):
+        log.warning("the GPS positions of %d photographs have no altitude and do not count", no_altitude)
     centers = camera_centers(cameras)[0].detach().cpu().double().numpy()
     place = fit_place(centers @ frame.to_source[:3, :3].T + frame.to_source[:3, 3], positions)
     if place is None:

@@ -89,6 +89,7 @@ class Scene:
             1 + e; infinite without a measured depth. None: not stated.
         support: ``[V, H, W]`` uint8 :class:`vg2gt.visibility.Status` of each pixel; None: unknown.
         poses: ``[V, 4, 4]`` float64 ``world_to_camera``, if known more precisely than in ``cameras``.
+        is_object: whether the surroundings were cut off (:meth:`cut_to_object`), so that meshes are closed.
     """
 
     gaussians: Gaussians
@@ -107,6 +108,7 @@ class Scene:
     poses: Tensor | None = None
     error: Tensor | None = None
     support: Tensor | None = None
+    is_object: bool = False
 
     @property
     def camera_source(self) -> CameraSource:

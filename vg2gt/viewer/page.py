@@ -28,7 +28,7 @@ from vg2gt.types import Gaussians
 from vg2gt.viewer.content import ViewerScene
 
 STATIC = Path(__file__).with_name("static")
-_PARTS = "address shaders decode sorting camera picking controls renderer tools main"
+_PARTS = "address shaders decode sorting detail camera picking controls renderer tools main"
 SCRIPTS = tuple(f"{name}.js" for name in _PARTS.split())
 JPEG_QUALITY = 85
 UNSIGNED, SIGNED = 2**16 - 1, 2**15 - 1  # largest values stored in 16 bits

@@ -12,6 +12,7 @@ from PIL import Image
 from vg2gt.data import DataError
 from vg2gt.data.sources import Nerfstudio
 from vg2gt.data.transforms import resize
+from vg2gt.inputs.given_cameras import given_pictures
 
 from .layout_nerfstudio import write
 from .layouts import LEFT_HALF, halve, room, save
@@ -138,6 +139,9 @@ def test_blenders_synthetic_sets(tmp_path):
     assert (loaded.images[..., :20] == 1).all()  # item 7: what was hidden under alpha 0 is no part of the scene
     assert torch.allclose(loaded.images[..., 20:], frames.images[..., 20:], atol=1 / 400)
     assert torch.equal(loaded.mask[0, 0], (torch.arange(40) >= 20).float())
+    shutil.rmtree(folder / "images")
+    for given, count in ((folder, 4), (folder / "train", 3), (folder / "test", 2)):
+        assert len(given_pictures(given) or []) == count  # test frames only if they are asked for
 
 
 def test_masks_of_a_rig_are_those_of_their_camera(tmp_path):

@@ -6,6 +6,7 @@ scene.
 
 from __future__ import annotations
 
+import codecs
 import glob
 import os
 import re
@@ -101,7 +102,9 @@ def read_text_lines(path: Path, scene: str) -> list[str]:
 
 def _read_lines(path: Path, scene: str) -> list[str]:
     try:
-        return regular(path).read_text(encoding="utf-8").splitlines()
+        content = regular(path).read_bytes()
+        marked = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))  # as PowerShell writes text
+        return content.decode("utf-16" if marked else "utf-8-sig").splitlines()
     except (OSError, ValueError) as error:
         raise DataError(f"cannot read {path} of scene {scene}: {error}") from error
 

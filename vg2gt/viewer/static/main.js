@@ -1,5 +1,5 @@
 // Wires the page together. window.vg2gtViewer is for scripts: ready (a promise), setCamera(index or camera record), which
-// resolves when that view is drawn completely, and loadSeconds. The address may end in
+// resolves when that view is drawn completely, drawn() (the number of Gaussians in the last frame) and loadSeconds. The address may end in
 // #camera=INDEX&show=cameras,images&fly=on&ui=off (address.js).
 
 const started = performance.now();
@@ -15,7 +15,8 @@ async function start() {
   const buffer = await inflate(element("gaussians").textContent);
   element("gaussians").remove();  // megabytes of text
   const { means, harmonics, geometry } = decodeGaussians(scene.gaussians, buffer);
-  const renderer = new Renderer(canvas, scene.settings), sorter = new DepthSorter(means);
+  const weights = weightsOf(geometry), detail = new Detail(weights);
+  const renderer = new Renderer(canvas, scene.settings), sorter = new DepthSorter(means, weights);
   renderer.setGaussians(geometry, harmonics, scene.gaussians.degree);
   const records = scene.cameras.length ? scene.cameras : [scene.initial];
   const pictures = await Promise.all(scene.cameras.map(({ picture }) => picture && decodePicture(picture)));
@@ -24,16 +25,22 @@ async function start() {
   const up = records.map(fromRecord).reduce((sum, { axes }) => addScaled(sum, axes[1], -1), [0, 0, 0]);
   const view = new View(Math.hypot(...up) > 0.1 ? unit(up) : [0, -1, 0]);
   const show = { frusta: false, images: false }, crop = { box: null };
-  let version = 0, drawn = -1, busy = false, waiting = [];
+  let version = 0, drawn = -1, busy = false, moving = false, whole = true, rest = 0, waiting = [];
 
   // Sorts for the newest view and draws; in between frames show the newest view in an older order. The first one is
-  // sorted here: it is sooner than a worker starts.
+  // sorted here: it is sooner than a worker starts. Large scenes are drawn completely once the view rests.
   async function update() {
     busy = true;
     while (drawn < version) {
       const now = version, axis = [...view.axes[2], view.translation()[2]], near = scene.settings.near;
-      renderer.setOrder(drawn < 0 ? makeDepthSorter(means)(axis, near) : await sorter.sort(axis, near, crop.box));
+      const began = performance.now(), least = moving ? detail.least() : 0, measured = moving;
+      whole = least === 0;
+      renderer.setOrder(drawn < 0 ? makeDepthSorter(means)(axis, near) : await sorter.sort(axis, near, crop.box, least));
       paint();
+      if (measured) {
+        await new Promise(requestAnimationFrame);
+        detail.adapt(performance.now() - began);
+      }
       drawn = now;
     }
     busy = false;
@@ -55,16 +62,30 @@ async function start() {
     if (width !== canvas.width || height !== canvas.height) changed();
   }
 
-  function changed() {
+  function redraw() {
     version++;
     if (busy) requestAnimationFrame(paint);
     else update();
   }
 
+  function changed() {
+    moving = true;
+    clearTimeout(rest);
+    rest = setTimeout(rested, 200);
+    redraw();
+  }
+
+  function rested() {
+    moving = false;
+    if (!whole) redraw();
+  }
+
   function complete() {
+    clearTimeout(rest);
+    moving = false;
     return new Promise((resolve) => {
       waiting.push(resolve);
-      changed();
+      redraw();
     });
   }
 
@@ -80,6 +101,7 @@ async function start() {
   const follow = connect({ canvas, view, changed, resized, setCamera, show, records, scene, pictures });
   connectTools({ canvas, view, changed, renderer, scene, geometry, means, crop });
   await follow(0);
+  viewer.drawn = () => renderer.visible;
   viewer.loadSeconds = (performance.now() - started) / 1000;
   return setCamera;
 }

@@ -1,0 +1,84 @@
+"""Given cameras that contradict their images, on real photographs with known cameras."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vg2gt.data.base import DataError
+from vg2gt.inputs import camera_check
+from vg2gt.inputs.camera_check import check_cameras
+from vg2gt.inputs.given_cameras import given_pictures
+from vg2gt.inputs.pictures import Picture
+from vg2gt.monitor import Monitor
+
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+@pytest.fixture(scope="module")
+def right(shared: Path) -> list[Picture]:
+    pytest.importorskip("pycolmap")
+    return given_pictures(shared / "data" / "hololens_office_a", 7) or []
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _matched_once(right: list[Picture]):
+    """The features of the same images are found and matched once."""
+    found = camera_check.matched(right)
+
+    def matched(pictures):
+        numbers = {f"{number:06d}.jpg": picture for number, picture in enumerate(pictures)}
+        return found[0], {name: replace(found[1][name], pose=each.pose) for name, each in numbers.items()}
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(camera_check, "matched", matched)
+        yield
+
+
+def turned(pictures: list[Picture], change: Callable[[int, np.ndarray], np.ndarray]) -> list[Picture]:
+    return [replace(each, pose=change(number, each.pose)) for number, each in enumerate(pictures)]
+
+
+def test_right_cameras_pass_and_those_of_a_sparse_model_are_known(right: list[Picture], caplog) -> None:
+    check_cameras(right, Monitor())
+    monitor = Monitor()
+    check_cameras([replace(each, pose=np.eye(4), points="of the model") for each in right], monitor)  # pyright: ignore
+    assert not caplog.records
+    assert not monitor.seconds
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda _, pose: np.linalg.inv(pose), "world-to-camera, or the reverse: correct"),
+        (lambda _, pose: FLIP @ pose, "if the poses are in OpenGL axes"),
+        (lambda _, pose: np.linalg.inv(pose) @ FLIP, "or the reverse, and in the other of OpenGL's"),
+        (lambda number, pose: None, "Check their order"),
+    ],
+)
+def test_what_is_wrong_is_said(right: list[Picture], change, said: str, caplog) -> None:
+    poses = [each.pose for each in right]
+    if "order" in said:
+        wrong = [replace(each, pose=pose) for each, pose in zip(right, poses[::-1], strict=True)]
+    else:
+        wrong = turned(right, change)
+    with pytest.raises(DataError, match=r"contradict the images: in \d of \d pairs") as error:
+        check_cameras(wrong, Monitor())
+    assert said in str(error.value)
+    assert "--poses sfm" in str(error.value)
+    with pytest.raises(DataError) as error:
+        check_cameras([replace(each, source="Nerfstudio folder") for each in wrong], Monitor())
+    if "in the other of" in said:  # a transforms.json has OpenGL axes, so its poses are only inverse
+        assert "world-to-camera, or the reverse: correct" in str(error.value)
+    check_cameras(wrong, Monitor(), insisted=True)
+    assert "they are used as they are" in caplog.text
+
+
+def test_single_wrong_cameras_are_named(right: list[Picture], caplog) -> None:
+    wrong = turned(right, lambda number, pose: np.linalg.inv(pose) if number == 6 else pose)
+    check_cameras(wrong, Monitor())
+    assert "some cameras may be wrong" in caplog.text
+    assert right[6].name in caplog.text
+    assert right[0].name not in caplog.text

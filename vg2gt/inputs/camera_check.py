@@ -1,0 +1,171 @@
+"""Whether given cameras fit their images: matched features must lie where the cameras see one point."""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from vg2gt.data.base import DataError
+from vg2gt.data.transforms import reduce_to_fit, to_bytes
+from vg2gt.inputs.folds import Matches
+from vg2gt.inputs.pictures import Picture, spread
+from vg2gt.inputs.sfm import find_features, match_features
+from vg2gt.io.cameras_json import invert_pose
+from vg2gt.io.colmap import PIXEL_CENTER, quiet_colmap
+from vg2gt.io.errors import some
+from vg2gt.monitor import Monitor
+
+log = logging.getLogger(__name__)
+
+_GROUPS = 5  # neighbours in the given order that are looked at, evenly spread
+_SIDE, _FEATURES = 640, 2000  # longer side of the images in pixels, and their features
+_FEWEST = 30  # verified matches of a pair
+_PAIRS = 3  # pairs that tell something
+_WITHIN = 0.02  # of the longer side: between a feature and the ray of its match
+_PARALLEL = 0.3  # degrees between rays, below which the sign of the depth is noise
+_FITTING = 0.5  # share of a pair's matches that fit, below which the pair contradicts the cameras
+_CONTRADICTED = 0.5  # share of the pairs that contradict the cameras, from which they are wrong altogether
+_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+@dataclass(frozen=True)
+class CheckedView:
+    """Camera of an image: intrinsics ``[3, 3]`` at its ``(height, width)``, and ``world_to_camera [4, 4]``."""
+
+    intrinsics: NDArray[np.float64]
+    pose: NDArray[np.float64]
+    size: tuple[int, int]
+
+
+_INVERSE = "camera-to-world instead of world-to-camera, or the reverse"
+_BOTH = f"{_INVERSE}, and in the other of OpenGL's and OpenCV's axes"
+_READINGS: dict[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
+    _INVERSE: invert_pose,
+    "in OpenGL axes instead of OpenCV's, or the reverse": lambda pose: _FLIP @ pose,
+    _BOTH: lambda pose: invert_pose(pose @ _FLIP),
+}
+
+
+def check_cameras(pictures: Sequence[Picture], monitor: Monitor, insisted: bool = False) -> None:
+    """Checks given cameras by matched features of up to ten images, if pycolmap is installed.
+
+    A match fits if the cameras see one point in front of both within 2 % of the longer side.
+
+    Args:
+        pictures: pictures with given cameras. Those of a sparse model, whose points are such matches, are not checked.
+        monitor: shows the stage.
+        insisted: only warn, because these cameras were asked for.
+
+    Raises:
+        DataError: if at least half of the pairs of images contradict the cameras; fewer are a warning.
+    """
+    known = [each for each in pictures if each.pose is not None and each.points is None]
+    if len(known) < len(pictures) or len(known) < 2 or importlib.util.find_spec("pycolmap") is None:
+        return
+    starts = spread(len(known) - 1, min(_GROUPS, len(known) - 1))
+    chosen = [known[place] for place in sorted({place + step for place in starts for step in range(2)})]
+    with monitor.stage("check cameras"):
+        matches, views = matched(chosen)
+    shares = agreement(matches, views)
+    titles = {name: each.name for name, each in _numbered(chosen)}
+    against = [f"{titles[one]} and {titles[other]}" for (one, other), share in shares.items() if share < _FITTING]
+    if not against or len(shares) < min(_PAIRS, len(chosen) - 1):
+        return
+    said = (
+        f"the cameras of {pictures[0].source} contradict the images: in {len(against)} of {len(shares)} pairs of "
+        f"images, most matched features are not where the cameras see one point ({some(against, 3)})"
+    )
+    if len(against) < _CONTRADICTED * len(shares):
+        log.warning("%s; some cameras may be wrong, or the images show things that look alike or move", said)
+        return
+    said = f"{said}. {_advice(matches, views, pictures[0].source.startswith('Nerfstudio'))}"
+    if not insisted:
+        raise DataError(f"{said}; --poses sfm finds the cameras from the images, --poses given takes these as they are")
+    log.warning("%s; they are used as they are", said)
+
+
+def _advice(matches: Matches, views: dict[str, CheckedView], is_opengl: bool) -> str:
+    """Says what is wrong with contradicted cameras, in the axes of their file."""
+    for reading, change in _READINGS.items():
+        changed = {name: replace(view, pose=change(view.pose)) for name, view in views.items()}
+        if min(agreement(matches, changed).values()) >= _FITTING:
+            swapped = {_INVERSE: _BOTH, _BOTH: _INVERSE} if is_opengl else {}
+            return f"They fit if the poses are {swapped.get(reading, reading)}: correct them"
+    return "Check their order, axes and focal length"
+
+
+def matched(pictures: Sequence[Picture]) -> tuple[Matches, dict[str, CheckedView]]:
+    """Returns matched features of pictures, and their cameras by the names there."""
+    with tempfile.TemporaryDirectory(prefix="vg2gt-check-") as temporary, quiet_colmap():
+        folder, silent = Path(temporary), Monitor()
+        (folder / "images").mkdir()
+        views = {name: _staged(each, folder / "images" / name) for name, each in _numbered(pictures)}
+        lenses: dict[tuple[int, int, float], list[str]] = {}
+        for name, view in views.items():
+            lenses.setdefault((*view.size, 0.0), []).append(name)
+        find_features(folder, lenses, sorted(views), (_SIDE, _FEATURES, 0), silent)
+        match_features(folder, sorted(views), silent)
+        return Matches.read(folder / "database.db"), views
+
+
+def _numbered(pictures: Sequence[Picture]) -> list[tuple[str, Picture]]:
+    return [(f"{number:06d}.jpg", picture) for number, picture in enumerate(pictures)]
+
+
+def _staged(picture: Picture, file: Path) -> CheckedView:
+    """Writes a reduced picture and returns its camera."""
+    assert picture.pose is not None
+    scale = min(1.0, _SIDE / max(picture.size))
+    target = (round(picture.size[0] * scale), round(picture.size[1] * scale))
+    frames = reduce_to_fit(picture.read(target), (_SIDE, _SIDE))
+    pixels = to_bytes(frames.images[0]).permute(1, 2, 0).numpy()
+    Image.fromarray(pixels).save(file, quality=95)
+    return CheckedView(frames.intrinsics[0].double().numpy(), picture.pose, (pixels.shape[0], pixels.shape[1]))
+
+
+def agreement(matches: Matches, views: dict[str, CheckedView]) -> dict[tuple[str, str], float]:
+    """Returns the share of matches that fit the cameras, of every image's pair with most matches."""
+    strongest: dict[str, tuple[str, str]] = {}
+    for pair, rows in matches.pairs.items():
+        for name in pair if len(rows) >= _FEWEST else ():
+            if name not in strongest or len(rows) > len(matches.pairs[strongest[name]]):
+                strongest[name] = pair
+    found = {}
+    for pair in sorted(set(strongest.values())):
+        rows = matches.pairs[pair]
+        pixels = [matches.features[name][rows[:, side]] - PIXEL_CENTER for side, name in enumerate(pair)]
+        found[pair] = float(_fits(pixels, [views[name] for name in pair]).mean())
+    return found
+
+
+def _fits(pixels: Sequence[NDArray[np.float64]], views: Sequence[CheckedView]) -> NDArray[np.bool_]:
+    """Returns which matches ``[m]`` two cameras see as one point in front of both."""
+    rays, centers = [], []
+    for points, view in zip(pixels, views, strict=True):
+        turn = view.pose[:3, :3]
+        own = np.concatenate([points, np.ones((len(points), 1))], 1) @ np.linalg.inv(view.intrinsics).T @ turn
+        rays.append(own / np.linalg.norm(own, axis=1, keepdims=True))
+        centers.append(-turn.T @ view.pose[:3, 3])
+    cosine = (rays[0] * rays[1]).sum(1)
+    sine2 = np.maximum(1 - cosine**2, 1e-12)
+    base = centers[1] - centers[0]
+    along = [rays[0] @ base, -(rays[1] @ base)]
+    # distances along both rays to where they are closest
+    depths = [(along[0] + cosine * along[1]) / sine2, (along[1] + cosine * along[0]) / sine2]
+    parallel = sine2 < np.sin(np.radians(_PARALLEL)) ** 2
+    fits = np.ones(len(cosine), bool)
+    for one, other in ((0, 1), (1, 0)):
+        points = centers[one] + np.where(parallel, 1e6 * np.linalg.norm(base), depths[one])[:, None] * rays[one]
+        local = points @ views[other].pose[:3, :3].T + views[other].pose[:3, 3]
+        shown = local @ views[other].intrinsics.T
+        error = np.linalg.norm(shown[:, :2] / shown[:, 2:] - pixels[other], axis=1)
+        fits &= (local[:, 2] > 0) & (parallel | (depths[one] > 0)) & (error < _WITHIN * max(views[other].size))
+    return fits
