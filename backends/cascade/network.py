@@ -22,8 +22,8 @@ from vg2gt.geometry.precision import full_precision
 
 PLANES = 64
 _SPACING = 1 / (PLANES - 1)
-ROW = 16  # planes of a row at 1/4, where there are two
-_QUARTER, _HALF = (ROW, 0.25 * _SPACING), (8, 0.1 * _SPACING)  # planes and spacing of the later stages
+_QUARTER, _HALF = (16, 0.25 * _SPACING), (8, 0.1 * _SPACING)  # planes of a row, and spacing, of the later stages
+ROWS = (1, 2, 1)  # rows of planes of the stages
 _OTHER = 3 * _SPACING  # distance from a centre from which on a plane of the first stage counts as another answer
 _CHANNELS = (16, 16, 8)  # of the regularisation of each stage
 _AGREEMENT = (0.1, 0.05)  # widths of the agreement at 1/8 and 1/4
@@ -171,10 +171,21 @@ class CascadeNet(nn.Module):
         warp: SourceWarp,
         visible: Tensor,
     ) -> tuple[Sweep, Tensor]:
-        """The stage at 1/4, around the log-depth ``center`` and around the likeliest plane that is not near it.
+        """The stage at 1/4, on two rows of planes: around ``center``, and around the likeliest plane not near it.
 
         At 1/8 a thin object shares its cell with what is behind it, and a wrong guess may replace a right match.
-        ``share`` is that of the matched depth in ``center``, ``[V, 1, h / 2, w / 2]``.
+
+        Args:
+            center: log-depth ``[V, 1, h, w]``.
+            first: the stage at 1/8.
+            share: share of the matched depth in ``center``, ``[V, 1, h / 2, w / 2]``.
+            features: features of all views.
+            planes: unit of their planes.
+            warp: correspondences with the best sources.
+            visible: visibility of the pixels in them ``[V, n, h / 2, w / 2]``.
+
+        Returns:
+            The stage, with the planes of both rows, and the visibility ``[V, n, h, w]``.
         """
         likely = F.interpolate(first.logits.detach().softmax(1), size=center.shape[-2:], mode="nearest")
         near = (first.position - planes.position(center.detach())).abs() <= _OTHER  # [V, PLANES, h, w]
@@ -186,12 +197,12 @@ class CascadeNet(nn.Module):
         one, kept = self._narrow(1, center, _QUARTER, features, planes, warp, visible)
         two, _ = self._narrow(1, other, _QUARTER, features, planes, warp, visible)
         logits = torch.cat((one.logits, two.logits + bias), 1)
-        # the depth is that of the bracket with the likelier peak, so that the two are never averaged
-        second = two.logits.amax(1, keepdim=True) + bias > one.logits.amax(1, keepdim=True)
+        # the depth is that of the row with the likelier peak, so that the two are never averaged
+        is_other = two.logits.amax(1, keepdim=True) + bias > one.logits.amax(1, keepdim=True)
         shares = logits.unflatten(1, (2, -1)).logsumexp(2).softmax(1)  # [V, 2, h, w]
-        mass = torch.where(second, two.mass * shares[:, 1:], one.mass * shares[:, :1])
+        mass = torch.where(is_other, two.mass * shares[:, 1:], one.mass * shares[:, :1])
         position = torch.cat((one.position, two.position), 1)
-        return Sweep(logits, position, torch.where(second, two.t, one.t), mass), kept
+        return Sweep(logits, position, torch.where(is_other, two.t, one.t), mass), kept
 
     def _narrow(
         self,

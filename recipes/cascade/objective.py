@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from backends.cascade.network import PLANES, ROW, CascadeEncoding
+from backends.cascade.network import PLANES, ROWS, CascadeEncoding
 from backends.cascade.planes import Planes, baselines
 from backends.sweep.network import Sweep
 from recipes.cascade.samples import Sample
@@ -55,12 +55,12 @@ def objective(
         "gradient": sum((_gradient(error[:, ::k, ::k], valid[:, ::k, ::k]) for k in (1, 2, 4)), torch.zeros(())),
     }
     sums: dict[str, list[Tensor]] = {"planes": [], "stages": [], "centers": [], "guess": []}
-    for stage, center, cell in zip(encoding.stages, encoding.centers, (8, 4, 2), strict=True):
+    for stage, center, cell, rows in zip(encoding.stages, encoding.centers, (8, 4, 2), ROWS, strict=True):
         inverse, seen = cell_inverse(sample.depth, cell)
         weight = seen * F.avg_pool2d(sample.weight[:, None], cell)
         truth = inverse.clamp_min(1e-9).reciprocal()
         found = -planes.inverse(stage.t).log()
-        sums["planes"].append(plane_entropy(stage, planes.position(truth.log()), seen))
+        sums["planes"].append(plane_entropy(stage, planes.position(truth.log()), seen, rows))
         looked = {"stages": found, "centers": center} | ({"guess": encoding.guess} if cell == 8 else {})
         for name, log_depth in looked.items():
             off = _limited(_log_error(log_depth, truth, farthest)[0])
@@ -94,13 +94,19 @@ def _gradient(error: Tensor, valid: Tensor) -> Tensor:
     return down.mean() + right.mean()
 
 
-def plane_entropy(stage: Sweep, t: Tensor, known: Tensor) -> Tensor:
-    """Cross-entropy of the planes; the target ``t [V, 1, h, w]`` is split linearly between its two nearest planes.
+def plane_entropy(stage: Sweep, t: Tensor, known: Tensor, rows: int = 1) -> Tensor:
+    """Cross-entropy of the planes of a stage; the target is split linearly between its two nearest planes.
 
-    Where a stage has two rows of planes, the target is in the first one that holds it.
+    Args:
+        stage: the stage.
+        t: true positions ``[V, 1, h, w]``.
+        known: 1 where they are known, else 0, ``[V, 1, h, w]``.
+        rows: number of rows of evenly spaced planes; the target is in the first row that holds it.
+
+    Returns:
+        The mean over the pixels whose target is in a row; 0 if there are none.
     """
     entropy, every = torch.zeros_like(t), torch.zeros_like(t)
-    rows = 2 if stage.position.shape[1] == 2 * ROW else 1
     likely = F.log_softmax(stage.logits, 1)
     for position, row in zip(stage.position.chunk(rows, 1), likely.chunk(rows, 1), strict=True):
         count = position.shape[1]

@@ -11,7 +11,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file
 
 from backends.cascade import CascadeBackend
-from backends.cascade.network import ROW, CascadeEncoding, CascadeNet
+from backends.cascade.network import CascadeEncoding, CascadeNet
 from backends.cascade.planes import Planes, baselines
 from backends.sweep.backend import SHIPPED
 from backends.sweep.network import Sweep
@@ -67,6 +67,8 @@ def slope() -> tuple[Sample, CascadeEncoding]:
         position = torch.arange(count).view(1, -1, 1, 1) * spacing
         if cell < 8:
             position = t + position - position.mean()
+        if cell == 4:  # a second row, of nearer planes
+            position = torch.cat((position, position + 8 / 63), 1)
         share = (1 - (position - t).abs() / spacing).clamp_min(1e-6)
         stages.append(Sweep(share.log(), position.expand(2, -1, -1, -1), t, torch.ones_like(t)))
         centers.append(truth)
@@ -189,18 +191,18 @@ def test_a_slim_room_is_read_as_it_was_written(tmp_path: Path) -> None:
     torch.testing.assert_close(scene.intrinsics, truth.intrinsics.float(), rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.parametrize("place", [3.25, ROW + 3.25])
+@pytest.mark.parametrize("place", [3.25, 19.25])
 def test_the_target_of_the_planes_is_in_the_row_that_holds_it(place: float) -> None:
     """A depth in either of two rows is learnt there; one between the rows teaches nothing."""
-    position = torch.cat((torch.arange(ROW) * 0.01 + 0.2, torch.arange(ROW) * 0.01 + 0.6)).view(1, -1, 1, 1)
-    logits = torch.zeros(1, 2 * ROW, 1, 1, requires_grad=True)
+    position = torch.cat((torch.arange(16) * 0.01 + 0.2, torch.arange(16) * 0.01 + 0.6)).view(1, -1, 1, 1)
+    logits = torch.zeros(1, 32, 1, 1, requires_grad=True)
     stage = Sweep(logits, position, torch.zeros(1, 1, 1, 1), torch.zeros(1, 1, 1, 1))
     low, share = int(place), place % 1
     t = torch.full((1, 1, 1, 1), float(position[0, low, 0, 0] + 0.01 * share))
-    plane_entropy(stage, t, torch.ones_like(t)).backward()
+    plane_entropy(stage, t, torch.ones_like(t), rows=2).backward()
     assert logits.grad is not None
-    expected = torch.full((2 * ROW,), 1 / (2 * ROW))
+    expected = torch.full((32,), 1 / 32)
     expected[low] -= 1 - share
     expected[low + 1] -= share
     torch.testing.assert_close(logits.grad.flatten(), expected, rtol=0, atol=1e-4)
-    assert float(plane_entropy(stage, torch.full_like(t, 0.5), torch.ones_like(t)).detach()) == 0
+    assert float(plane_entropy(stage, torch.full_like(t, 0.5), torch.ones_like(t), rows=2).detach()) == 0

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from vg2gt.data.base import DataError
 from vg2gt.inputs import camera_check
@@ -26,14 +27,14 @@ def right(shared: Path) -> list[Picture]:
 @pytest.fixture(scope="module", autouse=True)
 def _matched_once(right: list[Picture]):
     """The features of the same images are found and matched once."""
-    found = camera_check.matched(right)
+    found = camera_check.match_pictures(right)
 
-    def matched(pictures):
+    def match_pictures(pictures):
         numbers = {f"{number:06d}.jpg": picture for number, picture in enumerate(pictures)}
         return found[0], {name: replace(found[1][name], pose=each.pose) for name, each in numbers.items()}
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(camera_check, "matched", matched)
+        patch.setattr(camera_check, "match_pictures", match_pictures)
         yield
 
 
@@ -82,3 +83,17 @@ def test_single_wrong_cameras_are_named(right: list[Picture], caplog) -> None:
     assert "some cameras may be wrong" in caplog.text
     assert right[6].name in caplog.text
     assert right[0].name not in caplog.text
+
+
+@pytest.mark.parametrize("turn", [1, -1])
+def test_cameras_in_one_place_see_in_the_same_direction(turn: int) -> None:
+    """As the faces of a panorama and the photographs of a tripod; a turn the wrong way does not fit."""
+    intrinsics = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("y", 10, degrees=True).as_matrix()
+    there = np.random.default_rng(0).uniform((-0.2, -0.2, 1), (0.2, 0.2, 1), (50, 3))
+    shown = [there @ intrinsics.T, there @ pose[:3, :3].T @ intrinsics.T]
+    pixels = [each[:, :2] / each[:, 2:] for each in shown]
+    pose[:3, :3] = Rotation.from_euler("y", 10 * turn, degrees=True).as_matrix()
+    views = [camera_check.CheckedView(intrinsics, each, (480, 640)) for each in (np.eye(4), pose)]
+    assert camera_check._fits(pixels, views).mean() == (turn == 1)

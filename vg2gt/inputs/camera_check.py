@@ -73,8 +73,8 @@ def check_cameras(pictures: Sequence[Picture], monitor: Monitor, insisted: bool 
     starts = spread(len(known) - 1, min(_GROUPS, len(known) - 1))
     chosen = [known[place] for place in sorted({place + step for place in starts for step in range(2)})]
     with monitor.stage("check cameras"):
-        matches, views = matched(chosen)
-    shares = agreement(matches, views)
+        matches, views = match_pictures(chosen)
+    shares = fitting_shares(matches, views)
     titles = {name: each.name for name, each in _numbered(chosen)}
     against = [f"{titles[one]} and {titles[other]}" for (one, other), share in shares.items() if share < _FITTING]
     if not against or len(shares) < min(_PAIRS, len(chosen) - 1):
@@ -96,13 +96,13 @@ def _advice(matches: Matches, views: dict[str, CheckedView], is_opengl: bool) ->
     """Says what is wrong with contradicted cameras, in the axes of their file."""
     for reading, change in _READINGS.items():
         changed = {name: replace(view, pose=change(view.pose)) for name, view in views.items()}
-        if min(agreement(matches, changed).values()) >= _FITTING:
+        if min(fitting_shares(matches, changed).values()) >= _FITTING:
             swapped = {_INVERSE: _BOTH, _BOTH: _INVERSE} if is_opengl else {}
             return f"They fit if the poses are {swapped.get(reading, reading)}: correct them"
     return "Check their order, axes and focal length"
 
 
-def matched(pictures: Sequence[Picture]) -> tuple[Matches, dict[str, CheckedView]]:
+def match_pictures(pictures: Sequence[Picture]) -> tuple[Matches, dict[str, CheckedView]]:
     """Returns matched features of pictures, and their cameras by the names there."""
     with tempfile.TemporaryDirectory(prefix="vg2gt-check-") as temporary, quiet_colmap():
         folder, silent = Path(temporary), Monitor()
@@ -131,7 +131,7 @@ def _staged(picture: Picture, file: Path) -> CheckedView:
     return CheckedView(frames.intrinsics[0].double().numpy(), picture.pose, (pixels.shape[0], pixels.shape[1]))
 
 
-def agreement(matches: Matches, views: dict[str, CheckedView]) -> dict[tuple[str, str], float]:
+def fitting_shares(matches: Matches, views: dict[str, CheckedView]) -> dict[tuple[str, str], float]:
     """Returns the share of matches that fit the cameras, of every image's pair with most matches."""
     strongest: dict[str, tuple[str, str]] = {}
     for pair, rows in matches.pairs.items():
@@ -160,12 +160,14 @@ def _fits(pixels: Sequence[NDArray[np.float64]], views: Sequence[CheckedView]) -
     along = [rays[0] @ base, -(rays[1] @ base)]
     # distances along both rays to where they are closest
     depths = [(along[0] + cosine * along[1]) / sine2, (along[1] + cosine * along[0]) / sine2]
+    far = 1e6 * (np.linalg.norm(base) or 1.0)  # any distance will do for cameras in one place, as on a tripod
     parallel = sine2 < np.sin(np.radians(_PARALLEL)) ** 2
     fits = np.ones(len(cosine), bool)
     for one, other in ((0, 1), (1, 0)):
-        points = centers[one] + np.where(parallel, 1e6 * np.linalg.norm(base), depths[one])[:, None] * rays[one]
+        points = centers[one] + np.where(parallel, far, depths[one])[:, None] * rays[one]
         local = points @ views[other].pose[:3, :3].T + views[other].pose[:3, 3]
         shown = local @ views[other].intrinsics.T
-        error = np.linalg.norm(shown[:, :2] / shown[:, 2:] - pixels[other], axis=1)
+        with np.errstate(divide="ignore", invalid="ignore"):  # beside or in the camera: does not fit
+            error = np.linalg.norm(shown[:, :2] / shown[:, 2:] - pixels[other], axis=1)
         fits &= (local[:, 2] > 0) & (parallel | (depths[one] > 0)) & (error < _WITHIN * max(views[other].size))
     return fits

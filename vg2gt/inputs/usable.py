@@ -50,8 +50,15 @@ _OFTEN = 0.7  # share of the images, and of the pixels along the border, in whic
 
 @dataclass(frozen=True)
 class _Look:
-    """What a small copy of a picture shows: shares of black and white pixels, spread and detail of the brightness,
-    and how much the channels differ.
+    """What a small copy of a picture shows.
+
+    Attributes:
+        black: share of black pixels.
+        white: share of white pixels.
+        spread: standard deviation of the brightness.
+        detail: fine detail relative to the coarse one.
+        color: difference of the channels, of 255.
+        is_pair: whether it is a stereo pair, side by side.
     """
 
     black: float
@@ -214,6 +221,7 @@ def _faults(looks: dict[str, _Look]) -> dict[str, str]:
     )
 
     def fault(look: _Look) -> str:
+        """Returns what is wrong with one; empty if nothing is."""
         if look.black >= (_NEARLY_ALL if several and black < _USUAL else _ALL):
             return "is black"
         if look.white >= (_NEARLY_ALL if several and white < _USUAL else _ALL):

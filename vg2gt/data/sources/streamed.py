@@ -95,7 +95,8 @@ def _opened(root: str, process: int) -> Any:
     from litdata import StreamingDataset  # pyright: ignore[reportMissingImports]
     from litdata.streaming.serializers import _SERIALIZERS, BytesSerializer  # pyright: ignore[reportMissingImports]
 
-    # whatever a stream says its items are, they are taken as bytes and not unpickled
+    # Whatever a stream says its items are, they are taken as bytes and not unpickled. If this import breaks with a new
+    # litdata: _SERIALIZERS maps names of kinds to serializers, and each of them is to be replaced.
     return StreamingDataset(root, serializers={name: BytesSerializer() for name in _SERIALIZERS})
 
 

@@ -1,6 +1,6 @@
 // Wires the page together. window.vg2gtViewer is for scripts: ready (a promise), setCamera(index or camera record), which
-// resolves when that view is drawn completely, drawn() (the number of Gaussians in the last frame) and loadSeconds. The address may end in
-// #camera=INDEX&show=cameras,images&fly=on&ui=off (address.js).
+// resolves when that view is drawn completely, drawn() (the number of Gaussians in the last frame) and loadSeconds. The
+// address may end in #camera=INDEX&show=cameras,images&fly=on&ui=off (address.js).
 
 const started = performance.now();
 const element = (id) => document.getElementById(id);
