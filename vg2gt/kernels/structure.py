@@ -1,22 +1,24 @@
-"""``1 - SSIM`` and its gradient in one compiled pass (:func:`vg2gt.losses.gaussian.structure_loss`)."""
+"""``1 - SSIM`` and its gradient in two compiled passes (:func:`vg2gt.losses.gaussian.structure_loss`)."""
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from vg2gt.kernels.compiled import kernel
+from vg2gt.kernels.compiled import kernel, kernel_part
 from vg2gt.kernels.threads import parallel_for
 
 WINDOW, SIGMA = 11, 1.5  # kornia's Gaussian has this standard deviation for every window size
 HALF = WINDOW // 2
 C1, C2 = np.float32(0.01**2), np.float32(0.03**2)
-Bands = tuple[np.ndarray, np.ndarray]
 ONE, TWO, ZERO = np.float32(1), np.float32(2), np.float32(0)
+FAST = {"contract", "nsz", "arcp"}
+_ROWS = 64  # of a plane at a time
+_WEIGHTS = np.exp(-(np.arange(-HALF, HALF + 1) ** 2) / (2 * SIGMA**2))
+_WEIGHTS = (_WEIGHTS / _WEIGHTS.sum()).astype(np.float32)
 
 
 class Structure(torch.autograd.Function):
@@ -25,18 +27,34 @@ class Structure(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, images: Tensor, reference: Tensor) -> Tensor:
         """Returns the loss."""
-        planes = [tensor.detach().flatten(0, 1).contiguous().numpy() for tensor in (images, reference)]
-        gradient = np.empty_like(planes[0])
-        totals = np.empty(len(gradient))
-        rows, columns = (_bands(size) for size in gradient.shape[1:])
+        around = ((0, 0), (HALF, HALF), (HALF, HALF))
+        x, y = (np.pad(each.detach().flatten(0, 1).numpy(), around, "reflect") for each in (images, reference))
+        given = np.stack((x, y, x * x + y * y, x * y), 1)
+        planes, height, width = len(x), *images.shape[-2:]
+        # derivatives of SSIM by the windowed means of x, x^2 + y^2 and x y, with zeros around
+        derivatives = np.zeros((planes, 3, height + 4 * HALF, width + 4 * HALF), np.float32)
+        gradient = np.empty_like(x)
 
-        def work(plane: int) -> None:
-            totals[plane] = _similarity(planes[0][plane], planes[1][plane], rows, columns, gradient[plane])
+        def parts(rows: int) -> list[tuple[int, int, int]]:
+            starts = range(0, rows, _ROWS)
+            return [(plane, first, min(first + _ROWS, rows)) for plane in range(planes) for first in starts]
 
-        parallel_for(range(len(totals)), work)
-        gradient *= np.float32(-1 / gradient.size)
-        ctx.gradient = torch.from_numpy(gradient).view(images.shape)
-        return images.new_tensor(1 - totals.sum() / gradient.size)
+        pieces = parts(height)
+        totals = np.empty(len(pieces))
+
+        def compare(piece: int) -> None:
+            plane, first, last = pieces[piece]
+            totals[piece] = _compare(given[plane], _WEIGHTS, derivatives[plane], first, last)
+
+        def gather(piece: tuple[int, int, int]) -> None:
+            plane, first, last = piece
+            _gather(given[plane], _WEIGHTS, derivatives[plane], gradient[plane], first, last)
+
+        parallel_for(range(len(pieces)), compare)
+        parallel_for(parts(height + 2 * HALF), gather)
+        inner = _folded(gradient) * np.float32(-1 / images.numel())
+        ctx.gradient = torch.from_numpy(inner).view(images.shape)
+        return images.new_tensor(1 - totals.sum() / images.numel())
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
@@ -44,73 +62,89 @@ class Structure(torch.autograd.Function):
         return ctx.gradient * gradients[0], None
 
 
-@lru_cache(maxsize=16)
-def _bands(size: int) -> Bands:
-    """Returns diagonals ``[11, n]`` of the window's matrix along an axis (borders reflected) and of its transpose."""
-    weights = np.exp(-(np.arange(-HALF, HALF + 1) ** 2) / (2 * SIGMA**2))
-    matrix = np.zeros((size, size))
-    for place in range(size):
-        for weight, source in zip(weights / weights.sum(), range(place - HALF, place + HALF + 1), strict=True):
-            reflected = abs(source) if source < size else 2 * (size - 1) - source
-            matrix[place, reflected] += weight
-    places, padded = np.arange(size), np.zeros((2, size, size + 2 * HALF))
-    padded[:, :, HALF:-HALF] = matrix, matrix.T
-    first, second = np.stack([padded[:, places, places + k] for k in range(WINDOW)], 1)
-    return first.astype(np.float32), second.astype(np.float32)
+def _folded(padded: np.ndarray) -> np.ndarray:
+    """Adds the reflected borders of ``[P, H + 10, W + 10]`` to the pixels that they repeat; returns ``[P, H, W]``."""
+    for planes in (padded, padded.swapaxes(1, 2)):
+        for k in range(1, HALF + 1):
+            planes[:, HALF + k] += planes[:, HALF - k]
+            planes[:, -1 - HALF - k] += planes[:, -1 - HALF + k]
+    return padded[:, HALF:-HALF, HALF:-HALF]
 
 
-def _similarity(x: np.ndarray, y: np.ndarray, rows: Bands, columns: Bands, gradient: np.ndarray) -> float:
-    """Returns the sum of one plane's SSIM; writes its derivative by ``x`` ``[H, W]`` into ``gradient``."""
-    means = [_window(values, rows[0], columns[0]) for values in (x, y, x * x, y * y, x * y)]
-    total = _combine(*(mean.ravel() for mean in means))
-    of_mean, of_square, of_product = (_window(means[part], rows[1], columns[1]) for part in (0, 2, 4))
-    of_square *= x
-    of_product *= y
-    np.add(of_mean, of_square, out=gradient)
-    gradient += of_product
-    return total
+@kernel(fastmath=FAST, error_model="numpy", nogil=True)
+def _compare(given, weights, derivatives, first, last):
+    """Returns the sum of SSIM over some rows of one plane.
 
-
-def _window(values: np.ndarray, down: np.ndarray, across: np.ndarray) -> np.ndarray:
-    out = np.empty_like(values)
-    _blur(values, down, across, np.zeros(values.shape[1] + 2 * HALF, np.float32), out)
-    return out
-
-
-@kernel(fastmath={"contract", "nsz", "arcp"}, error_model="numpy", nogil=True)
-def _combine(a, b, p, q, r):
-    """Returns the sum of SSIM from windowed means of image, reference, their squares and product, ``[H W]`` each.
-
-    ``SSIM = (2 a b + C1) (2 (r - a b) + C2) / ((a^2 + b^2 + C1) (p - a^2 + q - b^2 + C2))``. Its derivatives by a, p
-    (doubled, because x^2 has the derivative 2 x) and r overwrite a, p and r.
+    ``SSIM = n1 n2 / (d1 d2)`` with ``n1 = 2 a b + C1``, ``d1 = a^2 + b^2 + C1``, ``n2 = 2 (r - a b) + C2`` and
+    ``d2 = s - a^2 - b^2 + C2``; a, b, s and r are the windowed means of image, reference, the sum of their squares and
+    their product. Writes the derivatives by a, s (doubled, because x^2 has the derivative 2 x) and r. LLVM vectorises
+    none of the loops if they write to more arrays.
     """
+    padded = given.shape[2]
+    width = padded - 2 * HALF
+    down, across = np.empty((4, padded), np.float32), np.empty((4, width), np.float32)
+    similarity = np.empty(width, np.float32)
     total = 0.0
-    for pixel in range(len(a)):
-        x, y = a[pixel], b[pixel]
-        n1, d1 = TWO * x * y + C1, x * x + y * y + C1
-        n2, d2 = TWO * (r[pixel] - x * y) + C2, (p[pixel] - x * x) + (q[pixel] - y * y) + C2
-        share = ONE / (d1 * d2)
-        similarity = n1 * n2 * share
-        total += similarity
-        a[pixel] = TWO * share * (y * (n2 - n1) + x * similarity * (d1 - d2))
-        p[pixel] = -TWO * similarity * share * d1
-        r[pixel] = TWO * share * n1
+    for i in range(first, last):
+        _down(given, weights, i, down)
+        _across(down, weights, across)
+        a, b, s, r = across
+        for j in range(width):
+            product, squares = a[j] * b[j], a[j] * a[j] + b[j] * b[j]
+            top = (TWO * product + C1) * (TWO * (r[j] - product) + C2)
+            similarity[j] = top / ((squares + C1) * (s[j] - squares + C2))
+        row = i + 2 * HALF
+        out = derivatives[0, row][2 * HALF :]
+        for j in range(width):
+            product, squares = a[j] * b[j], a[j] * a[j] + b[j] * b[j]
+            n1, d1 = TWO * product + C1, squares + C1
+            n2, d2 = TWO * (r[j] - product) + C2, s[j] - squares + C2
+            out[j] = TWO * (b[j] * (n2 - n1) + a[j] * similarity[j] * (d1 - d2)) / (d1 * d2)
+        out = derivatives[1, row][2 * HALF :]
+        for j in range(width):
+            out[j] = -TWO * similarity[j] / (s[j] - a[j] * a[j] - b[j] * b[j] + C2)
+        out = derivatives[2, row][2 * HALF :]
+        for j in range(width):
+            squares = a[j] * a[j] + b[j] * b[j]
+            out[j] = TWO * (TWO * a[j] * b[j] + C1) / ((squares + C1) * (s[j] - squares + C2))
+        for j in range(width):
+            total += similarity[j]
     return total
 
 
-@kernel(fastmath={"contract", "nsz", "arcp"}, error_model="numpy", nogil=True)
-def _blur(source, down, across, line, out):
-    """Filters ``source`` ``[H, W]`` into ``out``; ``line`` ``[W + 10]`` is scratch memory with zeros at both ends."""
-    height, width = source.shape
-    for i in range(height):
-        for j in range(width):
-            line[HALF + j] = ZERO
-        for k in range(max(0, HALF - i), min(WINDOW, height + HALF - i)):
-            weight, row = down[k, i], i + k - HALF
-            for j in range(width):
-                line[HALF + j] += weight * source[row, j]
-        for j in range(width):
-            out[i, j] = ZERO
+@kernel(fastmath=FAST, error_model="numpy", nogil=True)
+def _gather(given, weights, derivatives, gradient, first, last):
+    """Writes the derivative of the sum of SSIM by some rows of the padded image."""
+    down = np.empty((3, derivatives.shape[2]), np.float32)
+    across = np.empty((3, gradient.shape[1]), np.float32)
+    for i in range(first, last):
+        _down(derivatives, weights, i, down)
+        _across(down, weights, across)
+        of_mean, of_squares, of_product = across
+        here, there, out = given[0, i], given[1, i], gradient[i]
+        for j in range(len(out)):
+            out[j] = of_mean[j] + of_squares[j] * here[j] + of_product[j] * there[j]
+
+
+@kernel_part(fastmath=FAST, error_model="numpy")
+def _down(given, weights, i, sums):
+    """Windowed sums along the columns of ``[N, H + 10, W]`` at row i, into ``[N, W]``."""
+    sums[:] = ZERO
+    for k in range(WINDOW):
+        weight = weights[k]
+        for part in range(len(sums)):
+            row, out = given[part, i + k], sums[part]
+            for j in range(len(out)):
+                out[j] += weight * row[j]
+
+
+@kernel_part(fastmath=FAST, error_model="numpy")
+def _across(given, weights, sums):
+    """Windowed sums along rows ``[N, W + 10]`` into ``[N, W]``."""
+    sums[:] = ZERO
+    for part in range(len(sums)):
+        out = sums[part]
         for k in range(WINDOW):
-            for j in range(width):
-                out[i, j] += across[k, j] * line[k + j]
+            weight, shifted = weights[k], given[part, k : k + len(out)]
+            for j in range(len(out)):
+                out[j] += weight * shifted[j]
