@@ -34,7 +34,8 @@ def psnr(predicted: Tensor, reference: Tensor, weights: Tensor | None = None) ->
     Infinite for identical images. With pixel weights ``[..., H, W]``, the squared error is their weighted mean; NaN if
     all are 0.
     """
-    errors = (predicted.double().clamp(0, 1) - reference.double().clamp(0, 1)).square().mean(-3)
+    first, second = (x.to(torch.promote_types(x.dtype, torch.float32)).clamp(0, 1) for x in (predicted, reference))
+    errors = (first - second).square().mean(-3).double()
     if weights is None:
         return -10 * errors.mean((-2, -1)).log10()
     return -10 * ((errors * weights).sum((-2, -1)) / weights.double().sum((-2, -1))).log10()

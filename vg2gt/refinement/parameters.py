@@ -60,7 +60,10 @@ class RefinedScene(TensorRecord):
 
     def exposed(self, color: Tensor, views: Tensor) -> Tensor:
         """Applies the exposure of the views ``[R]`` to rendered colours ``[1, R, 3, H, W]``."""
-        return color * self.gain[views, :, None, None] + self.bias[views, :, None, None]
+        gain, bias = self.gain[views], self.bias[views]
+        if not (gain.requires_grad or bias.requires_grad or (gain != 1).any() or bias.any()):
+            return color
+        return color * gain[:, :, None, None] + bias[:, :, None, None]
 
 
 class Parameters:
@@ -124,7 +127,9 @@ class Parameters:
         """Returns the current scene with autograd graph; ``rows [N]``: with these Gaussians only, in this order."""
         self._rows = rows
         self._leaves = values = {
-            name: (value.clone() if rows is None or name not in OF_GAUSSIANS else value[rows]).requires_grad_(True)
+            name: (
+                value.clone() if rows is None or name not in OF_GAUSSIANS else value.index_select(0, rows)
+            ).requires_grad_(bool(self.rates[name]))
             for name, value in self.values.items()
         }
         start = self.start
@@ -175,6 +180,8 @@ class Parameters:
         Returns:
             False, without a change, if a gradient is not finite.
         """
+        if not loss.requires_grad:  # all rates are 0
+            return bool(loss.isfinite())
         loss.backward()
         grads = {name: leaf.grad for name, leaf in self._leaves.items() if leaf.grad is not None and leaf.numel()}
         if not torch.stack([grad.sum() for grad in grads.values()]).isfinite().all():

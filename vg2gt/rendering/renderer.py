@@ -184,9 +184,14 @@ def _check_values(gaussians: Gaussians, cameras: Cameras, background: Tensor) ->
         _check_finite(name, getattr(gaussians, name))
     if len(gaussians) == 0:
         return
-    _require("scales", gaussians.scales >= MIN_SCALE, f"be at least {MIN_SCALE} (standard deviations in scene units)")
-    _require("opacities", (gaussians.opacities >= 0) & (gaussians.opacities <= 1), "be in [0, 1]")
-    _require("quats", gaussians.quats.detach().abs().sum(-1) > 0, "have nonzero norm")
+    # extremes first: one fast pass each, and enough in the common case
+    scales, opacities, quats = (each.detach() for each in (gaussians.scales, gaussians.opacities, gaussians.quats))
+    if not scales.amin() >= MIN_SCALE:
+        _require("scales", scales >= MIN_SCALE, f"be at least {MIN_SCALE} (standard deviations in scene units)")
+    if not (opacities.amin() >= 0 and opacities.amax() <= 1):
+        _require("opacities", (opacities >= 0) & (opacities <= 1), "be in [0, 1]")
+    if not quats.abs().amin() > 0:
+        _require("quats", quats.abs().sum(-1) > 0, "have nonzero norm")
     batch, scenes = gaussians.batch, len(cameras.world_to_camera)
     if batch[0] < 0 or batch[-1] >= scenes or (batch[1:] < batch[:-1]).any():
         raise ValueError(

@@ -11,6 +11,8 @@ from torch.nn import functional as F
 
 from vg2gt.geometry.cameras import invert_rigid
 from vg2gt.geometry.spherical_harmonics import sh_to_rgb
+from vg2gt.kernels.threads import compilable
+from vg2gt.rendering.cpu.colors import ViewColors
 from vg2gt.rendering.options import RenderOptions
 from vg2gt.types import Cameras, Gaussians, Render
 
@@ -77,19 +79,38 @@ def render_scenes(
 def _scene_views(gaussians: Gaussians, cameras: Cameras, scene: int, background: Tensor) -> SceneViews:
     """Returns one scene with its colours in every view (a single copy if they do not depend on the view)."""
     poses = cameras.world_to_camera[scene]
-    if gaussians.sh.shape[1] == 1:
-        directions = gaussians.means[None]  # not used: the colour is constant
-    else:
-        centers = invert_rigid(poses)[:, None, :3, 3]
-        directions = F.normalize(gaussians.means - centers, dim=-1)
     return SceneViews(
         gaussians.means,
         gaussians.quats,
         gaussians.scales,
         gaussians.opacities,
-        sh_to_rgb(gaussians.sh, directions),
+        view_colors(gaussians.sh, gaussians.means, poses),
         poses,
         cameras.intrinsics[scene],
         background,
         cameras.size,
     )
+
+
+def view_colors(sh: Tensor, means: Tensor, poses: Tensor) -> Tensor:
+    """Returns the colours of Gaussians in every view; compiled for float32 on a CPU.
+
+    Args:
+        sh: ``[G, (L + 1)^2, 3]``.
+        means: ``[G, 3]`` world positions.
+        poses: ``[V, 4, 4]`` world to camera.
+
+    Returns:
+        ``[V, G, 3]``, clamped to at least 0; ``[1, G, 3]`` if the colours do not depend on the view (L = 0).
+    """
+    if sh.shape[1] == 1:
+        return sh_to_rgb(sh, means[None])  # the directions are not used
+    centers = invert_rigid(poses)[:, :3, 3]
+    if compilable(sh, means, centers):
+        return ViewColors.apply(sh, means, centers)  # pyright: ignore[reportReturnType]
+    return view_colors_reference(sh, means, centers)
+
+
+def view_colors_reference(sh: Tensor, means: Tensor, centers: Tensor) -> Tensor:
+    """:func:`view_colors` in plain torch, from the centres ``[V, 3]`` of the cameras."""
+    return sh_to_rgb(sh, F.normalize(means - centers[:, None], dim=-1))
