@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -27,6 +28,7 @@ ROWS = (1, 2, 1)  # rows of planes of the stages
 _OTHER = 3 * _SPACING  # distance from a centre from which on a plane of the first stage counts as another answer
 _CHANNELS = (16, 16, 8)  # of the regularisation of each stage
 _AGREEMENT = (0.1, 0.05)  # widths of the agreement at 1/8 and 1/4
+_FARTHEST_MATCHED, _BEYOND = 0.95, 1.5  # quantile of the matched depth of a scene, and the greatest depth over it
 _BINS = 16  # channels that hold the summed probability of the planes
 _STATED = 1 + 1 + 3 + _BINS  # relative log-depth, mass, agreement, bins
 _SEEN = 32  # channels of the U-Net that the tokens see
@@ -105,7 +107,9 @@ class CascadeNet(nn.Module):
         agreeing = agreement((-matched).exp().detach(), warp, _AGREEMENT[0])
         if shown is not None:
             agreeing = agreeing * shown
-        scale = _scene_scale(matched.detach(), first.mass.detach() * agreeing[:, 1:2], views.scenes)  # [V, 1, 1, 1]
+        reliable = first.mass.detach() * agreeing[:, 1:2]
+        scale = _scene_quantile(matched.detach(), reliable, views.scenes, 0.5)  # [V, 1, 1, 1]
+        farthest = _scene_quantile(matched.detach(), reliable, views.scenes, _FARTHEST_MATCHED) + math.log(_BEYOND)
         # what does not match is filled in: U-Net, then attention
         bins = slices(first.logits.softmax(1), _BINS)
         stated = torch.cat((matched - scale, first.mass, agreeing, bins), 1)
@@ -120,7 +124,12 @@ class CascadeNet(nn.Module):
             """Log-depth, matched or guessed, the guess, and the share of the matched one."""
             guess = scale + change[:, 1:2]
             share = torch.sigmoid(sure + change[:, 2:])
-            return share * (matched + 0.1 * change[:, :1]) + (1 - share) * guess, guess, share
+            center = share * (matched + 0.1 * change[:, :1]) + (1 - share) * guess
+            if (
+                not torch.is_grad_enabled()
+            ):  # walls without texture were taken for sky in rooms unlike those of training
+                center = torch.minimum(center, farthest)
+            return center, guess, share
 
         place = self._places(blend(change)[0], scale, views, grid)
         tokens = attend(self.blocks[:2], tokens, place, grid, views.scenes)[-1]
@@ -230,10 +239,10 @@ class CascadeNet(nn.Module):
         return self.position(place)
 
 
-def _scene_scale(log_depth: Tensor, weight: Tensor, scenes: int) -> Tensor:
-    """Weighted median of the log-depth of each scene, ``[V, 1, 1, 1]``."""
+def _scene_quantile(log_depth: Tensor, weight: Tensor, scenes: int, share: float) -> Tensor:
+    """Weighted quantile of the log-depth of each scene, ``[V, 1, 1, 1]``."""
     views = len(log_depth) // scenes
     values, order = log_depth.reshape(scenes, -1).sort(1)
     mass = (weight.reshape(scenes, -1) + 1e-4).gather(1, order).cumsum(1)
-    middle = (mass < 0.5 * mass[:, -1:]).sum(1, keepdim=True)
-    return values.gather(1, middle).repeat_interleave(views, 0).view(-1, 1, 1, 1)
+    place = (mass < share * mass[:, -1:]).sum(1, keepdim=True)
+    return values.gather(1, place).repeat_interleave(views, 0).view(-1, 1, 1, 1)

@@ -169,6 +169,18 @@ def test_depth_is_in_the_unit_of_the_cameras_and_needs_no_range(make_scene) -> N
         backend.encode(images, given)
 
 
+def test_nothing_is_much_farther_than_what_matches(make_scene, network: CascadeNet) -> None:
+    """In training nothing is limited: sky must be able to become infinitely far."""
+    views = posed(make_scene)
+    with torch.no_grad():
+        network.fill.bias += torch.tensor([20.0, -20.0])  # a guess e^20 times too far, everywhere
+        limited = encode(network, views)
+    assert limited.guess.min() > 10
+    matched = -Planes(baselines(views.world_to_camera)).inverse(limited.stages[0].t).log()
+    assert limited.centers[0].max() <= matched.max() + 0.41
+    assert encode(network, views).centers[0].max() > 10
+
+
 def test_weights_must_be_named() -> None:
     with pytest.raises(FileNotFoundError, match=r"no published weights: give backend\.path=FILE"):
         CascadeBackend()

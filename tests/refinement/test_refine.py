@@ -64,6 +64,13 @@ def test_the_first_camera_stays_the_others_move_and_exposures_share_nothing(refi
     assert (gain[refined.held_out] == 1).all()
 
 
+def test_nothing_moves_if_all_rates_are_0(start: Start) -> None:
+    rates = RefineRates(**dict.fromkeys(("means", "quats", "scales", "opacities", "sh", "cameras"), 0.0))
+    kept = run(start, replace(OPTIONS, steps=4, fill=0, rates=rates))
+    assert same(kept.scene, kept.start)
+    assert kept.ended == "steps"
+
+
 def test_it_repeats_to_the_bit_and_never_looks_at_held_out_views(refined: Refined, start: Start) -> None:
     images = start.seen.images.clone()
     images[refined.held_out] = 1 - images[refined.held_out]
