@@ -173,7 +173,7 @@ def test_nothing_is_much_farther_than_what_matches(make_scene, network: CascadeN
     """In training nothing is limited: sky must be able to become infinitely far."""
     views = posed(make_scene)
     with torch.no_grad():
-        network.fill.bias += torch.tensor([20.0, -20.0])  # a guess e^20 times too far, everywhere
+        network.fill.bias.add_(torch.tensor([20.0, -20.0]))  # a guess e^20 times too far, everywhere
         limited = encode(network, views)
     assert limited.guess.min() > 10
     matched = -Planes(baselines(views.world_to_camera)).inverse(limited.stages[0].t).log()

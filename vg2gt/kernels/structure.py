@@ -27,39 +27,47 @@ class Structure(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, images: Tensor, reference: Tensor) -> Tensor:
         """Returns the loss."""
-        around = ((0, 0), (HALF, HALF), (HALF, HALF))
-        x, y = (np.pad(each.detach().flatten(0, 1).numpy(), around, "reflect") for each in (images, reference))
-        given = np.stack((x, y, x * x + y * y, x * y), 1)
-        planes, height, width = len(x), *images.shape[-2:]
-        # derivatives of SSIM by the windowed means of x, x^2 + y^2 and x y, with zeros around
-        derivatives = np.zeros((planes, 3, height + 4 * HALF, width + 4 * HALF), np.float32)
-        gradient = np.empty_like(x)
-
-        def parts(rows: int) -> list[tuple[int, int, int]]:
-            starts = range(0, rows, _ROWS)
-            return [(plane, first, min(first + _ROWS, rows)) for plane in range(planes) for first in starts]
-
-        pieces = parts(height)
-        totals = np.empty(len(pieces))
-
-        def compare(piece: int) -> None:
-            plane, first, last = pieces[piece]
-            totals[piece] = _compare(given[plane], _WEIGHTS, derivatives[plane], first, last)
-
-        def gather(piece: tuple[int, int, int]) -> None:
-            plane, first, last = piece
-            _gather(given[plane], _WEIGHTS, derivatives[plane], gradient[plane], first, last)
-
-        parallel_for(range(len(pieces)), compare)
-        parallel_for(parts(height + 2 * HALF), gather)
-        inner = _folded(gradient) * np.float32(-1 / images.numel())
-        ctx.gradient = torch.from_numpy(inner).view(images.shape)
-        return images.new_tensor(1 - totals.sum() / images.numel())
+        gradient, total = np.empty(images.shape, np.float32), 0.0
+        for image, other, out in zip(images.detach().numpy(), reference.detach().numpy(), gradient, strict=True):
+            total += _similarity(image, other, out)  # one by one, to bound memory
+        ctx.gradient = torch.from_numpy(gradient).mul_(-1 / images.numel())
+        return images.new_tensor(1 - total / images.numel())
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
         """Returns the gradient of the images."""
         return ctx.gradient * gradients[0], None
+
+
+def _similarity(images: np.ndarray, reference: np.ndarray, gradient: np.ndarray) -> float:
+    """Returns the sum of SSIM over planes ``[C, H, W]``; writes its derivative by ``images`` into ``gradient``."""
+    around = ((0, 0), (HALF, HALF), (HALF, HALF))
+    x, y = (np.pad(each, around, "reflect") for each in (images, reference))
+    given = np.stack((x, y, x * x + y * y, x * y), 1)
+    planes, height, width = images.shape
+    # derivatives of SSIM by the windowed means of x, x^2 + y^2 and x y, with zeros around
+    derivatives = np.zeros((planes, 3, height + 4 * HALF, width + 4 * HALF), np.float32)
+    padded = np.empty_like(x)  # derivative by the padded image
+
+    def parts(rows: int) -> list[tuple[int, int, int]]:
+        starts = range(0, rows, _ROWS)
+        return [(plane, first, min(first + _ROWS, rows)) for plane in range(planes) for first in starts]
+
+    pieces = parts(height)
+    totals = np.empty(len(pieces))
+
+    def compare(piece: int) -> None:
+        plane, first, last = pieces[piece]
+        totals[piece] = _compare(given[plane], _WEIGHTS, derivatives[plane], first, last)
+
+    def gather(piece: tuple[int, int, int]) -> None:
+        plane, first, last = piece
+        _gather(given[plane], _WEIGHTS, derivatives[plane], padded[plane], first, last)
+
+    parallel_for(range(len(pieces)), compare)
+    parallel_for(parts(height + 2 * HALF), gather)
+    gradient[:] = _folded(padded)
+    return float(totals.sum())
 
 
 def _folded(padded: np.ndarray) -> np.ndarray:
