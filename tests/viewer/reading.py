@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from vg2gt.types import Gaussians
-from vg2gt.viewer.page import SIGNED, UNSIGNED
+from vg2gt.viewer.packing import SIGNED, UNSIGNED
 
 
 def read_viewer_html(path: Path) -> Gaussians:

@@ -33,7 +33,7 @@ for (let i = 0; i < count; i++) {
 inflate = async () => null;
 decodeGaussians = () => ({ means, harmonics: null, geometry });
 Renderer = class {
-  setGaussians() {} setFrusta() {} resize() {} draw() {}
+  allocate() {} put() {} setFrusta() {} resize() {} draw() {}
   setOrder(order) { drawn.push(order.length); }
 };
 let move;
@@ -42,7 +42,7 @@ connectTools = () => {};
 pivotDepth = () => 1;
 for (const id of ["view", "cameras", "scene", "gaussians"]) element(id).remove = () => {};
 made.scene.textContent = JSON.stringify({
-  gaussians: { degree: 0 }, settings: { near: 0.1 }, cameras: [], frustum_depth: 1, initial: RECORD,
+  gaussians: { degree: 0, count }, settings: { near: 0.1 }, cameras: [], frustum_depth: 1, initial: RECORD,
 });
 made.view.clientWidth = made.view.clientHeight = 10;
 window.devicePixelRatio = 1;

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from vg2gt.types import Gaussians
 
 CAMERAS, VIEWS = "cameras.json", "views.npz"  # next to scene.ply, as vg2gt reconstruct writes them
+LARGE = 1_000_000  # Gaussians from which a page in one file is slow
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -33,6 +34,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     add("--html", type=Path, metavar="FILE", help="the page to write; default: SCENE.html next to the scene")
     add("--open", action="store_true", help="open the page in the browser")
     add("--title", help="title of the page; default: the scene's name, of scene.ply its folder's")
+    add("--levels", action="store_true", help="levels of detail in a folder next to the page, for a million Gaussians")
     with errors_in_one_line():
         run(parser.parse_args(argv))
 
@@ -63,8 +65,10 @@ def run(arguments: argparse.Namespace) -> None:
         cameras = cameras_of_scene(read_cameras(source), file, gaussians)
         sources = [source.parent, source.parent / VIEWS] if arguments.images is None else [arguments.images]
         scene = replace(scene, cameras=cameras, pictures=_pictures(cameras, sources))
-    path = write_viewer_html(arguments.html or file.with_suffix(".html"), scene)
+    path = write_viewer_html(arguments.html or file.with_suffix(".html"), scene, arguments.levels)
     print(f"{path}: {len(gaussians)} Gaussians, {path.stat().st_size / 1e6:.1f} MB; open it in a browser")
+    if len(gaussians) > LARGE and not arguments.levels:
+        print("a scene of this size opens and moves faster with --levels")
     if arguments.open:
         webbrowser.open(path.resolve().as_uri())
 

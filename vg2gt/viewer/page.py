@@ -1,17 +1,15 @@
 """A scene as one self-contained HTML file: Gaussians, cameras, pictures and the viewer's script.
 
 The page loads nothing from the network. Its content security policy allows only the script with the given hash and no
-connections, so that nothing in a scene can run code.
+connections, so that nothing in a scene can run code. That of a page with tiles allows what this script loads, too.
 """
 
 from __future__ import annotations
 
 import base64
-import gzip
 import hashlib
 import html
 import json
-import math
 import re
 from pathlib import Path
 from typing import Any
@@ -20,78 +18,54 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vg2gt.io.files import write_text
-from vg2gt.io.gaussian_arrays import to_arrays
 from vg2gt.io.images import encode_image
 from vg2gt.rendering.constants import ALPHA_MIN, COMPENSATION_FLOOR, JACOBIAN_CLAMP
 from vg2gt.rendering.options import RenderOptions
-from vg2gt.types import Gaussians
 from vg2gt.viewer.content import ViewerScene
+from vg2gt.viewer.levels import TILE, write_levels
+from vg2gt.viewer.packing import pack, without_zeros
 
 STATIC = Path(__file__).with_name("static")
-_PARTS = "address shaders decode sorting detail camera picking controls renderer tools main"
+_PARTS = "address shaders decode sorting detail camera levels picking controls renderer tools main"
 SCRIPTS = tuple(f"{name}.js" for name in _PARTS.split())
 JPEG_QUALITY = 85
-UNSIGNED, SIGNED = 2**16 - 1, 2**15 - 1  # largest values stored in 16 bits
 
 
-def write_viewer_html(path: str | Path, scene: ViewerScene) -> Path:
+def write_viewer_html(path: str | Path, scene: ViewerScene, levels: bool = False) -> Path:
     """Writes the page atomically; it opens from disk in any browser with WebGL 2.
 
     Args:
         path: output file.
         scene: scene to show; not changed. Pictures are stored as JPEG, Gaussians as described in :func:`pack`.
+        levels: write levels of detail in tiles to a folder next to the page, its name with ``_levels``, from which the
+            page loads what the view needs; scenes that fit into one tile need none.
 
     Raises:
-        ValueError: if the Gaussians are of more than one scene or have values that cannot be shown.
+        ValueError: if the Gaussians are of more than one scene or have values that cannot be shown, or the folder has
+            other files.
     """
-    header, packed = pack(scene.gaussians)
+    path, gaussians, tiles = Path(path), without_zeros(scene.gaussians), None
+    if levels and len(gaussians) > TILE:
+        gaussians, tiles = write_levels(path.with_name(f"{path.stem}_levels"), gaussians)
+    header, packed = pack(gaussians)
     script = '(() => {\n"use strict";\n' + "\n".join(_static(name) for name in SCRIPTS) + "})();\n"
     style = _static("style.css")
+    loaded = " 'strict-dynamic'" if tiles else ""
     policy = (
-        f"default-src 'none'; script-src '{_hash(script)}'; worker-src blob:; style-src '{_hash(style)}'; "
+        f"default-src 'none'; script-src '{_hash(script)}'{loaded}; worker-src blob:; style-src '{_hash(style)}'; "
         "base-uri 'none'; form-action 'none'"
     )
     parts = {
         "policy": policy,
         "title": html.escape(scene.title),
         "style": style,
-        "scene": _json_in_html(_content(scene, header)),
+        "scene": _json_in_html({**_content(scene, header), "levels": tiles}),
         "gaussians": base64.b64encode(packed).decode(),
         "script": script,
     }
     # one pass, so that no text inside a part is taken for a placeholder
     page = re.sub(r"\{\{(\w+)\}\}", lambda place: parts[place[1]], _static("page.html"))
     return write_text(path, page)
-
-
-def pack(gaussians: Gaussians) -> tuple[dict[str, float], bytes]:
-    """Encodes one scene for the page's script; the highest SH degrees are left out if they are all zero.
-
-    Returns:
-        Header for the script, and the columns, little endian and gzip-compressed: float32 means, float16 SH
-        coefficients, 16-bit logarithms of the standard deviations between the scene's smallest and largest, 16-bit
-        components of unit quaternions, 16-bit opacities.
-
-    Raises:
-        ValueError: if there is more than one scene, or a value that is not finite or out of range.
-    """
-    arrays = to_arrays(gaussians)
-    length = np.linalg.norm(arrays.quats, axis=-1, keepdims=True)
-    sh, half_max = arrays.sh, float(np.finfo(np.float16).max)
-    while sh.shape[1] > 1 and not sh[:, (math.isqrt(sh.shape[1]) - 1) ** 2 :].any():
-        sh = sh[:, : (math.isqrt(sh.shape[1]) - 1) ** 2]
-    logs = np.log(arrays.scales)
-    low, high = float(logs.min()), float(logs.max())
-    columns = (
-        arrays.means.astype("<f4"),
-        sh.clip(-half_max, half_max).astype("<f2"),
-        np.rint((logs - low) / max(high - low, 1e-12) * UNSIGNED).astype("<u2"),
-        np.rint(arrays.quats / length * SIGNED).astype("<i2"),
-        np.rint(arrays.opacities * UNSIGNED).astype("<u2"),
-    )
-    content = gzip.compress(b"".join(column.tobytes() for column in columns), compresslevel=6, mtime=0)
-    degree = math.isqrt(sh.shape[1]) - 1
-    return {"count": len(sh), "degree": degree, "log_scale_min": low, "log_scale_max": high}, content
 
 
 def _content(scene: ViewerScene, header: dict[str, float]) -> dict[str, Any]:

@@ -14,10 +14,19 @@ async function start() {
   const scene = JSON.parse(element("scene").textContent), canvas = element("view");
   const buffer = await inflate(element("gaussians").textContent);
   element("gaussians").remove();  // megabytes of text
-  const { means, harmonics, geometry } = decodeGaussians(scene.gaussians, buffer);
-  const weights = weightsOf(geometry), detail = new Detail(weights);
-  const renderer = new Renderer(canvas, scene.settings), sorter = new DepthSorter(means, weights);
-  renderer.setGaussians(geometry, harmonics, scene.gaussians.degree);
+  const { count, degree } = scene.gaussians, first = decodeGaussians(scene.gaussians, buffer);
+  const levels = scene.levels && new Levels(scene.levels, scene.settings.near);
+  const room = levels ? levels.owners.length * levels.tile : count;
+  const [means, geometry] = levels ? [new Float32Array(3 * room), new Float32Array(12 * room)] : [first.means, first.geometry];
+  const weights = levels ? new Float32Array(DRAWN) : weightsOf(geometry), detail = new Detail(weights);
+  const renderer = new Renderer(canvas, scene.settings);
+  renderer.allocate(room, degree);
+  renderer.put(0, first.geometry, first.harmonics);
+  if (levels) {
+    means.set(first.means);
+    geometry.set(first.geometry);
+  }
+  const sorter = new DepthSorter(means, weights);
   const records = scene.cameras.length ? scene.cameras : [scene.initial];
   const pictures = await Promise.all(scene.cameras.map(({ picture }) => picture && decodePicture(picture)));
   renderer.setFrusta(scene.cameras.map(fromRecord), pictures, scene.frustum_depth);
@@ -26,6 +35,7 @@ async function start() {
   const view = new View(Math.hypot(...up) > 0.1 ? unit(up) : [0, -1, 0]);
   const show = { frusta: false, images: false }, crop = { box: null };
   let version = 0, drawn = -1, busy = false, moving = false, whole = true, rest = 0, waiting = [];
+  let ranges = [[0, count]];
 
   // Sorts for the newest view and draws; in between frames show the newest view in an older order. The first one is
   // sorted here: it is sooner than a worker starts. Large scenes are drawn completely once the view rests.
@@ -34,16 +44,18 @@ async function start() {
     while (drawn < version) {
       const now = version, axis = [...view.axes[2], view.translation()[2]], near = scene.settings.near;
       const began = performance.now(), least = moving ? detail.least() : 0, measured = moving;
-      whole = least === 0;
-      renderer.setOrder(drawn < 0 ? makeDepthSorter(means)(axis, near) : await sorter.sort(axis, near, crop.box, least));
+      const size = wantedSize(), most = moving ? detail.most : DRAWN;
+      ranges = levels?.choose(view, view.fitted(...size), size, most) ?? ranges;
+      whole = levels ? most === DRAWN : least === 0;
+      renderer.setOrder(drawn < 0 ? makeDepthSorter(means)(axis, near, null, 0, ranges)
+        : await sorter.sort(axis, near, crop.box, least, ranges));
       paint();
-      if (measured) {
-        await new Promise(requestAnimationFrame);
-        detail.adapt(performance.now() - began);
-      }
+      if (measured || levels?.loading.size) await new Promise(requestAnimationFrame);
+      if (measured) detail.adapt(performance.now() - began);
       drawn = now;
     }
     busy = false;
+    if (levels?.loading.size) return;
     for (const resolve of waiting.splice(0)) resolve();
   }
 
@@ -93,13 +105,28 @@ async function start() {
     const record = typeof camera === "number" ? records[camera] : camera;
     if (!record) throw new Error(`There is no camera ${camera}; the scene has ${records.length}.`);
     view.set(fromRecord(record));
-    view.pivot = pivotDepth(view, geometry, scene);
+    view.pivot = pivotDepth(view, geometry, scene, ranges);
     if (typeof camera === "number") element("cameras").selectedIndex = camera;
     return complete();
   }
 
   const follow = connect({ canvas, view, changed, resized, setCamera, show, records, scene, pictures });
-  connectTools({ canvas, view, changed, renderer, scene, geometry, means, crop });
+  connectTools({ canvas, view, changed, renderer, scene, geometry, means: first.means, crop, shown: () => ranges });
+  if (levels) {
+    levels.changed = () => {
+      if (levels.failed) say(levels.failed.message, true);
+      version++;
+      if (!busy) update();
+    };
+    window.vg2gtTile = async (k, j, header, text) => {
+      const tile = decodeGaussians(header, await inflate(text)), at = levels.first(k, j);
+      means.set(tile.means, 3 * at);
+      geometry.set(tile.geometry, 12 * at);
+      renderer.put(at, tile.geometry, tile.harmonics);
+      sorter.put(at, tile.means);
+      levels.done(levels.tiles[k][j]);
+    };
+  }
   await follow(0);
   viewer.drawn = () => renderer.visible;
   viewer.loadSeconds = (performance.now() - started) / 1000;
@@ -107,10 +134,10 @@ async function start() {
 }
 
 // Depth of what is in the middle of a camera's image, so that turning keeps it there.
-function pivotDepth(view, geometry, { settings, frustum_depth }) {
+function pivotDepth(view, geometry, { settings, frustum_depth }, ranges) {
   const { width, height } = view.lens, shares = [0.45, 0.5, 0.55], blur = settings.lowpass, near = settings.near;
   const places = shares.flatMap((x) => shares.map((y) => [x * width - 0.5, y * height - 0.5]));
-  const depths = places.map((place) => surfaceDepth(geometry, view, view.lens, place, { near, blur }));
+  const depths = places.map((place) => surfaceDepth(geometry, view, view.lens, place, { near, blur, ranges }));
   const found = depths.filter((depth) => depth !== null).sort((a, b) => a - b);
   return found.length ? found[found.length >> 1] : 50 * frustum_depth;
 }
@@ -144,7 +171,7 @@ function connect({ canvas, view, changed, resized, setCamera, show, records, sce
       changed();
     });
   }
-  const counts = `${scene.gaussians.count.toLocaleString("en")} Gaussians, ${scene.cameras.length} cameras`;
+  const count = scene.levels?.total ?? scene.gaussians.count, counts = `${count.toLocaleString("en")} Gaussians, ${scene.cameras.length} cameras`;
   const follow = (otherwise) => {  // does what the address asks for; otherwise: the camera if it names none, null: stay
     const wanted = readAddress(location.hash, records.length);
     element("panel").hidden = !wanted.panel;

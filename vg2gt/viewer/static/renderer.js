@@ -4,7 +4,7 @@ class Renderer {
   constructor(canvas, settings) {
     const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false });
     if (!gl) throw new Error("This browser has no WebGL 2, which the viewer needs.");
-    Object.assign(this, { gl, canvas, settings, gaussians: null, frusta: null });
+    Object.assign(this, { gl, canvas, settings, frusta: null });
     this.precise = Boolean(gl.getExtension("EXT_color_buffer_float"));
     this.splats = this.program(SPLAT_VERTEX, SPLAT_FRAGMENT, ["index"]);
     this.copy = this.program(COPY_VERTEX, COPY_FRAGMENT, []);
@@ -52,26 +52,38 @@ class Renderer {
     return texture;
   }
 
-  // Values as a texture of full rows, the last one uploaded alone because it is shorter.
-  table(values, channels, internal, format, type) {
-    const gl = this.gl, most = gl.getParameter(gl.MAX_TEXTURE_SIZE), texels = values.length / channels;
-    const width = Math.min(most, 4096, texels), full = Math.floor(texels / width), rest = texels - full * width;
-    if (full + 1 > most) throw new Error("The scene has more Gaussians than this graphics device can hold.");
+  // A texture for some texels a Gaussian, of full rows.
+  table(texels, each, internal) {
+    const gl = this.gl, most = gl.getParameter(gl.MAX_TEXTURE_SIZE), width = Math.min(most, 4096, texels);
+    if (Math.ceil(texels / width) > most) {
+      throw new Error("The scene has more Gaussians than this graphics device can hold; vg2gt view --levels helps.");
+    }
     const texture = this.texture(gl.NEAREST);
-    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 2);
-    gl.texStorage2D(gl.TEXTURE_2D, 1, internal, width, full + (rest > 0));
-    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, width, full, format, type, values, 0);
-    if (rest) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, full, rest, 1, format, type, values, full * width * channels);
-    return texture;
+    gl.texStorage2D(gl.TEXTURE_2D, 1, internal, width, Math.ceil(texels / width));
+    return { texture, width, each };
   }
 
-  setGaussians(geometry, harmonics, degree) {
-    const gl = this.gl;
-    this.gaussians = {
-      geometry: this.table(geometry, 4, gl.RGBA32F, gl.RGBA, gl.FLOAT),
-      harmonics: this.table(harmonics, 3, gl.RGB16F, gl.RGB, gl.HALF_FLOAT),
-      degree,
-    };
+  // Values from a Gaussian on whose row is its own; the last row is uploaded alone because it is shorter.
+  fill({ texture, width, each }, first, values, channels, ...kind) {
+    const gl = this.gl, texels = values.length / channels, full = Math.floor(texels / width), top = first * each / width;
+    this.bind(0, texture);
+    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 2);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, top, width, full, ...kind, values, 0);
+    const rest = texels - full * width;
+    if (rest) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, top + full, rest, 1, ...kind, values, full * width * channels);
+  }
+
+  // Makes room; put() fills it.
+  allocate(count, degree) {
+    const gl = this.gl, coefficients = (degree + 1) ** 2;
+    this.geometry = this.table(3 * count, 3, gl.RGBA32F);
+    this.harmonics = this.table(coefficients * count, coefficients, gl.RGB16F);
+    this.degree = degree;
+  }
+
+  put(first, geometry, harmonics) {
+    this.fill(this.geometry, first, geometry, 4, this.gl.RGBA, this.gl.FLOAT);
+    this.fill(this.harmonics, first, harmonics, 3, this.gl.RGB, this.gl.HALF_FLOAT);
   }
 
   setOrder(order) {
@@ -190,11 +202,11 @@ class Renderer {
     gl.uniform1f(uniforms.compensationFloor, settings.antialiased ? settings.compensation_floor : 1);
     gl.uniform1f(uniforms.alphaMin, settings.alpha_min);
     gl.uniform1f(uniforms.alphaMax, settings.alpha_max);
-    gl.uniform1i(uniforms.degree, this.gaussians.degree);
+    gl.uniform1i(uniforms.degree, this.degree);
     gl.uniform1i(uniforms.geometry, 0);
     gl.uniform1i(uniforms.harmonics, 1);
-    this.bind(0, this.gaussians.geometry);
-    this.bind(1, this.gaussians.harmonics);
+    this.bind(0, this.geometry.texture);
+    this.bind(1, this.harmonics.texture);
     gl.bindVertexArray(this.orderArray);
     gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.visible);
     gl.activeTexture(gl.TEXTURE0);

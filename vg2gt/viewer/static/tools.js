@@ -43,7 +43,7 @@ function toRecord(name, view) {
     world_to_camera: [...rows, [0, 0, 0, 1]] };
 }
 
-function connectTools({ canvas, view, changed, renderer, scene, geometry, means, crop }) {
+function connectTools({ canvas, view, changed, renderer, scene, geometry, means, crop, shown }) {
   const { near, lowpass, background } = scene.settings, kept = [], original = view.up;
   let points = [], start = null, bounds = null;
   const hex = (value) => Math.round(255 * Math.min(1, Math.max(0, value))).toString(16).padStart(2, "0");
@@ -66,7 +66,7 @@ function connectTools({ canvas, view, changed, renderer, scene, geometry, means,
     const moved = Math.hypot(clientX - start[0], clientY - start[1]) > CLICK;
     if (!element("measure").checked || moved) return;
     const lens = view.fitted(canvas.clientWidth, canvas.clientHeight);
-    const point = pointAt(geometry, view, lens, [offsetX - 0.5, offsetY - 0.5], { near, blur: lowpass });
+    const point = pointAt(geometry, view, lens, [offsetX - 0.5, offsetY - 0.5], { near, blur: lowpass, ranges: shown() });
     if (point) points = [...points.slice(-1), point];
     say(!point ? "There is no surface." : points.length < 2 ? "Click the second point."
       : measured(points, scene.cameras[0]?.metres_per_unit));
