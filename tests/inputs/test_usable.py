@@ -92,7 +92,41 @@ def test_grey_among_coloured_and_one_photograph_in_two_formats_are_left_out(tmp_
     found = usable_pictures(find_pictures(tmp_path), Monitor())
     assert [picture.path.name for picture in found if picture.path] == ["0.jpg", "1.jpg", "1.png", "2.jpg", "4.jpg"]
     assert "3 is without colour" in caplog.text
-    assert "is 0.jpg in another format" in caplog.text
+    assert f"shows the same as {tmp_path / '0.jpg'}" in caplog.text
+
+
+def photograph(seed: int) -> Image.Image:
+    """Large structures with fine detail, 432 x 288 pixels."""
+    coarse = Image.fromarray(scenery(seed, (36, 54))).resize((432, 288), Image.Resampling.BICUBIC)
+    return Image.blend(coarse, Image.fromarray(scenery(seed, (288, 432))), 0.3)
+
+
+def test_versions_of_a_photograph_are_left_out(tmp_path: Path, caplog) -> None:
+    """Edited, reduced and recompressed ones were used as further views.
+
+    Sequences of related names and frames of two cameras side by side are kept, and the version of one that is spoilt.
+    """
+    for folder in ("web", "left", "right"):
+        (tmp_path / folder).mkdir()
+    for number in range(4):
+        photograph(number).save(tmp_path / f"IMG_{number}.jpg", quality=92)
+        photograph(number).resize((216, 144)).save(tmp_path / "web" / f"IMG_{number}.jpg")
+        photograph(number + 20).save(tmp_path / "left" / f"{number}.jpg", quality=92)
+        shifted = np.roll(np.array(photograph(number + 20)), 1, 1)
+        Image.fromarray(shifted).save(tmp_path / "right" / f"{number}.jpg", quality=92)
+        photograph(50).save(tmp_path / f"slow {number}.jpg", quality=90 + number)
+    photograph(50).save(tmp_path / "slow.jpg", quality=95)
+    Image.eval(photograph(0), lambda value: min(255, value * 1.2)).save(tmp_path / "IMG_0-edited.jpg")
+    photograph(0).save(tmp_path / "IMG_0 (1).jpg", quality=50)
+    photograph(1).filter(ImageFilter.UnsharpMask()).save(tmp_path / "IMG_E1.jpg", quality=92)
+    photograph(7).filter(ImageFilter.GaussianBlur(9)).save(tmp_path / "IMG_7.jpg", quality=92)
+    photograph(7).save(tmp_path / "IMG_7-1.jpg", quality=92)
+    found = usable_pictures(find_pictures(tmp_path), Monitor())
+    names = {str(each.path.relative_to(tmp_path)) for each in found if each.path is not None}
+    places = ("IMG_", "left/", "right/", "slow ")
+    assert names == {"IMG_7-1.jpg", "slow.jpg", *(f"{place}{number}.jpg" for place in places for number in range(4))}
+    assert f"shows the same as {tmp_path / 'IMG_0.jpg'}" in caplog.text
+    assert "IMG_7 is blurred" in caplog.text
 
 
 def test_stereo_pairs_are_said(tmp_path: Path, caplog) -> None:

@@ -1,11 +1,13 @@
 import struct
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from vg2gt.io import FormatError, read_video, write_video
-from vg2gt.io.video import count_frames, read_frame
+from vg2gt.io.video import count_frames, read_frame, video_size
 
 
 def _frames(count: int = 6, size: tuple[int, int] = (32, 48)) -> list[np.ndarray]:
@@ -57,6 +59,30 @@ def test_frames_come_upright_and_mirrored_as_the_file_says(tmp_path: Path) -> No
         matrix = struct.pack(">9i", a << 16, b << 16, 0, c << 16, d << 16, 0, 0, 0, 1 << 30)
         path.write_bytes(content[:start] + matrix + content[start + 36 :])
         assert [np.array_equal(frame, expected) for _, frame in read_video(path)] == [True]
+
+
+@pytest.mark.parametrize(("aspect", "size"), [("4/3", (90, 120)), ("8/9", (101, 90)), ("1", (90, 90))])
+def test_pixels_that_are_not_square_are_stretched(tmp_path: Path, aspect: str, size: tuple[int, int]) -> None:
+    """As of DV, HDV and anamorphic lenses: a circle, stored squeezed, comes back round, also of one frame."""
+    av = pytest.importorskip("av")
+    height, width = size
+    y, x = np.mgrid[:height, :width]
+    inside = np.hypot(x - width / 2 + 0.5, y - height / 2 + 0.5) < 30
+    circle = np.repeat(np.where(inside, 255, 0).astype(np.uint8)[..., None], 3, -1)
+    stored = np.array(Image.fromarray(circle).resize((90, 90)))
+    with av.open(str(tmp_path / "squeezed.mp4"), "w") as container:
+        stream = container.add_stream("libx264", 10, {"crf": "10"})
+        stream.width = stream.height = 90
+        stream.codec_context.sample_aspect_ratio = Fraction(aspect)
+        stream.pix_fmt = "yuv444p"
+        container.mux(stream.encode(av.VideoFrame.from_ndarray(stored, "rgb24")))
+        container.mux(stream.encode(None))
+    ((_, frame),) = read_video(tmp_path / "squeezed.mp4")
+    assert video_size(tmp_path / "squeezed.mp4") == size
+    assert np.array_equal(frame, read_frame(tmp_path / "squeezed.mp4", 0))
+    rows, columns = np.nonzero(frame[..., 0] > 127)
+    assert np.ptp(rows) == pytest.approx(59, abs=1.5)
+    assert np.ptp(columns) == pytest.approx(59, abs=1.5)
 
 
 def test_ten_bits_are_read_as_eight(tmp_path: Path) -> None:

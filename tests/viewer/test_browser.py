@@ -4,6 +4,7 @@ import io
 import math
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -37,10 +38,10 @@ def page() -> Iterator[Any]:
         yield made
 
 
-def show(page: Any, path: Path, scene: ViewerScene, size: tuple[int, int], fragment: str = CLEAN) -> None:
+def show(page: Any, path: Path, scene: ViewerScene, size: tuple[int, int], fragment: str = CLEAN, levels=False) -> None:
     """Opens a scene's page in a window of ``(height, width)`` pixels and waits until it is drawn."""
     page.set_viewport_size({"width": size[1], "height": size[0]})
-    page.goto(write_viewer_html(path, scene).as_uri() + fragment)
+    page.goto(write_viewer_html(path, scene, levels).as_uri() + fragment)
     page.evaluate("vg2gtViewer.ready.then(() => null)")
 
 
@@ -183,3 +184,32 @@ def test_page_fetches_nothing_and_hostile_names_do_nothing(page: Any, tmp_path: 
     )
     assert page.evaluate("fetch('data:,x').then(() => 'fetched', () => 'refused')") == "refused"
     assert page.evaluate("window.hole") is None
+
+
+def test_tiles_that_are_in_view_are_loaded_and_drawn(page, tmp_path, monkeypatch, benchmark_script) -> None:
+    """What is seen is the whole scene's image, from disk; without the folder the page says so and shows little."""
+    monkeypatch.setattr("vg2gt.viewer.levels.TILE", 4096)
+    monkeypatch.setattr("vg2gt.viewer.levels.ALWAYS", 1024)
+    monkeypatch.setattr("vg2gt.viewer.page.TILE", 4096)
+    room, size = benchmark_script("render"), (120, 160)
+    near, cameras = room.room_gaussians(30_000, size, sigma=2.0), room.room_cameras(12, size)
+    gaussians = near.joined(replace(near, means=near.means + 50))  # another room, not in the first view
+    view = cameras.select(slice(0, 1))
+    scene = ViewerScene(gaussians, named_cameras(view, ["0"]))
+    asked: list[str] = []
+    page.on("request", lambda request: asked.append(request.url))
+    show(page, tmp_path / "room.html", scene, size, levels=True)
+    image, drawn = screenshot(page), page.evaluate("vg2gtViewer.drawn()")
+    truth = render(gaussians, view, "rasterized", geometry=False).color[0, 0]
+    tiles = {address for address in asked if "room_levels/" in address}
+    assert psnr(image, truth) > CLOSE
+    assert all(address.startswith(("file:", "blob:")) for address in asked)
+    assert 4 < len(tiles) < len(list((tmp_path / "room_levels").iterdir()))
+    assert drawn < 0.6 * len(gaussians)
+    shutil.rmtree(tmp_path / "room_levels")
+    page.reload()
+    page.evaluate("vg2gtViewer.ready.then(() => null)")
+    assert "room_levels of tiles is not next to the page" in page.evaluate(
+        "document.getElementById('status').textContent"
+    )
+    assert 1024 < page.evaluate("vg2gtViewer.drawn()") <= 4096

@@ -146,7 +146,8 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> Scene:
     print(f"seconds: {times}; peak memory {cost['peak_memory_mib']} MiB")
     print(f"written: {', '.join(str(folder / name) for name in options.save)}")
     if any(f"scene{suffix}" in options.save for suffix in READERS):
-        print(f"to look at it: vg2gt view {shlex.quote(str(folder))} --open")
+        levels = " --levels" * (len(scene.gaussians) > LARGE)
+        print(f"to look at it: vg2gt view {shlex.quote(str(folder))}{levels} --open")
     return scene
 
 

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from vg2gt.types import Gaussians
 
 CAMERAS, VIEWS = "cameras.json", "views.npz"  # next to scene.ply, as vg2gt reconstruct writes them
-LARGE = 1_000_000  # Gaussians from which a page in one file is slow
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -44,6 +43,7 @@ def run(arguments: argparse.Namespace) -> None:
     from vg2gt.inputs.camera_files import read_cameras
     from vg2gt.inputs.scene_cameras import cameras_of_scene
     from vg2gt.io import read_gaussians
+    from vg2gt.outputs.output_names import LARGE
     from vg2gt.outputs.saved import renderer_of, scene_file
     from vg2gt.rendering import Renderer
     from vg2gt.viewer import ViewerScene, scene_title, write_viewer_html

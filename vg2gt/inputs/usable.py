@@ -7,10 +7,8 @@ neither: its edge differs from image to image.
 from __future__ import annotations
 
 import logging
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -22,6 +20,7 @@ from vg2gt.data.base import DataError, Frames
 from vg2gt.data.sources.masks import joined_masks, resized_mask
 from vg2gt.data.transforms import to_bytes
 from vg2gt.inputs.damaged import name_left_out, reason_of
+from vg2gt.inputs.distinct import Versions
 from vg2gt.inputs.pictures import IN_MEMORY, Picture
 from vg2gt.io.errors import some
 from vg2gt.io.images import curvatures
@@ -37,7 +36,6 @@ _FLAT = 1.0  # standard deviation of the brightness of an image that shows nothi
 _GREY, _COLORFUL = 3, 20  # difference of the channels in 99 of 100 pixels: of a grey image, of a coloured one
 _COARSE = (4, 16)  # pixels of structures that blur leaves
 _BLURRED = 0.03  # least detail of 1 pixel in the worst direction, relative to the coarse one and to the images' median
-_SAME = 6.0  # mean difference of 255 of one photograph in two formats
 _SHOWN = 0.001  # share of the pixels that a mask shows at least
 _WIDE, _HALF, _PAIR = 1.7, 32, 0.9  # shape of stereo pairs, pixels of a half, least correlation of the halves
 _FEWEST = 3  # images that are compared with each other
@@ -96,27 +94,6 @@ class _Borders:
         return (~near).astype(np.float32) if len(often) and often.mean() >= _OFTEN else None
 
 
-class _Twins:
-    """Photographs of one name in several formats, such as IMG_1.HEIC and IMG_1.JPG."""
-
-    def __init__(self, pictures: Sequence[Picture]) -> None:
-        files = [each.path.with_suffix("") for each in pictures if each.path is not None]
-        self.seen: dict[Path, list[tuple[str, NDArray[np.uint8]]]] = {
-            name: [] for name, count in Counter(files).items() if count > 1
-        }
-
-    def of(self, picture: Picture, pixels: NDArray[np.uint8]) -> str:
-        """Returns the file name of an earlier photograph that shows the same; empty if there is none."""
-        earlier = self.seen.get(picture.path.with_suffix("")) if picture.path is not None else None
-        if earlier is None or picture.path is None:
-            return ""
-        for name, other in earlier:
-            if other.shape == pixels.shape and np.abs(other.astype(np.float32) - pixels).mean() < _SAME:
-                return name
-        earlier.append((picture.path.name, pixels))
-        return ""
-
-
 def usable_pictures(pictures: Sequence[Picture], monitor: Monitor) -> list[Picture]:
     """Returns the pictures that can be read and show something; those left out are named in a warning.
 
@@ -134,7 +111,7 @@ def usable_pictures(pictures: Sequence[Picture], monitor: Monitor) -> list[Pictu
     looks: dict[str, _Look] = {}
     faults: dict[str, str] = {}
     borders: dict[tuple[int, int], _Borders] = {}
-    twins = _Twins(pictures)
+    versions = Versions(pictures)
     with monitor.stage("check images", len(pictures)) as advance:
         for picture in pictures:
             try:
@@ -144,13 +121,13 @@ def usable_pictures(pictures: Sequence[Picture], monitor: Monitor) -> list[Pictu
             else:
                 if shown < _SHOWN:
                     faults[picture.name] = "is hidden by its mask (white in masks is what counts)"
-                if other := twins.of(picture, pixels):
-                    faults[picture.name] = f"is {other} in another format"
+                versions.add(picture, pixels)
                 looks[picture.name] = _look(pixels)
                 if _may_have_borders(picture):
                     borders.setdefault(picture.size, _Borders(pixels.shape[:2])).add(pixels.max(2))
             advance()
     faults |= _faults(looks)
+    faults |= versions.faults(faults)
     pairs = [name for name, look in looks.items() if look.is_pair]
     if 2 * len(pairs) > len(looks):
         log.warning(

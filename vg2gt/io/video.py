@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from av import VideoCodecContext, VideoFrame  # optional
     from av.container import InputContainer
     from av.packet import Packet
+    from av.video.stream import VideoStream
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".gif")
 _QUALITY = "18"  # constant rate factor of H.264: 0 is lossless, 23 is x264's default
@@ -57,7 +58,7 @@ def count_frames(path: str | Path) -> int:
 
 
 def read_video(path: str | Path, numbers: Container[int] | None = None) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-    """Decodes the frames of a video, turned upright by its display matrix.
+    """Decodes the frames of a video, turned upright by its display matrix and stretched to square pixels.
 
     Args:
         path: the file.
@@ -74,7 +75,7 @@ def read_video(path: str | Path, numbers: Container[int] | None = None) -> Itera
     with _opened(path) as container:
         for number, frame in enumerate(_decoded(container)):
             if numbers is None or number in numbers:
-                yield number, _upright(frame, container.streams.video[0].codec_context)
+                yield number, _upright(frame, container.streams.video[0])
         if number < 0:
             raise FormatError(f"{path}: {_UNDECODABLE}")
 
@@ -102,7 +103,7 @@ def sharpest_frames(path: str | Path, count: int, limit: int) -> Iterator[tuple[
         for _, frames in itertools.groupby(numbered, lambda pair: min(pair[0] * limit // count, limit - 1)):
             number, sharpest = max(frames, key=lambda pair: _sharpness(pair[1]))
             found = True
-            yield number, lambda frame=sharpest: _upright(frame, container.streams.video[0].codec_context)
+            yield number, lambda frame=sharpest: _upright(frame, container.streams.video[0])
         if not found:
             raise FormatError(f"{path}: {_UNDECODABLE}")
 
@@ -152,7 +153,7 @@ def read_frame(path: str | Path, number: int) -> NDArray[np.uint8]:
         container.seek(times[number], stream=container.streams.video[0])
         for frame in _decoded(container):
             if frame.pts == times[number]:
-                return _upright(frame, container.streams.video[0].codec_context)
+                return _upright(frame, container.streams.video[0])
     raise FormatError(f"{path}: frame {number} cannot be decoded; the file is damaged")
 
 
@@ -277,9 +278,9 @@ def _pixels(frame: VideoFrame, context: VideoCodecContext) -> NDArray[np.uint8]:
     return coded_to_srgb(deep.to_ndarray(), primaries, transfer)
 
 
-def _upright(frame: VideoFrame, context: VideoCodecContext) -> NDArray[np.uint8]:
-    """Converts a frame to sRGB ``[H, W, 3]``, rotated and mirrored by its display matrix."""
-    pixels = _pixels(frame, context)
+def _upright(frame: VideoFrame, stream: VideoStream) -> NDArray[np.uint8]:
+    """Converts a frame to sRGB ``[H, W, 3]`` of square pixels, rotated and mirrored by its display matrix."""
+    pixels = _squared(_pixels(frame, stream.codec_context), float(stream.sample_aspect_ratio or 1))
     matrix = frame.side_data.get("DISPLAYMATRIX")
     if matrix is None:
         return pixels
@@ -288,6 +289,13 @@ def _upright(frame: VideoFrame, context: VideoCodecContext) -> NDArray[np.uint8]
     if abs(b) > abs(a):
         pixels, a, d = pixels.swapaxes(0, 1), c, b
     return np.ascontiguousarray(pixels[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1])
+
+
+def _squared(pixels: NDArray[np.uint8], aspect: float) -> NDArray[np.uint8]:
+    """Enlarges an image whose pixels are ``aspect`` times as wide as high, as of DV, HDV and anamorphic lenses."""
+    height, width = pixels.shape[:2]
+    size = (round(width * max(aspect, 1)), round(height * max(1 / aspect, 1)))
+    return pixels if size == (width, height) else np.asarray(Image.fromarray(pixels).resize(size))
 
 
 @contextmanager
