@@ -68,7 +68,7 @@ def run(arguments: argparse.Namespace) -> None:
     path = write_viewer_html(arguments.html or file.with_suffix(".html"), scene, arguments.levels)
     print(f"{path}: {len(gaussians)} Gaussians, {path.stat().st_size / 1e6:.1f} MB; open it in a browser")
     if len(gaussians) > LARGE and not arguments.levels:
-        print("a scene of this size opens and moves faster with --levels")
+        print("with --levels, the page of a scene of this size loads and draws only what is needed for a view")
     if arguments.open:
         webbrowser.open(path.resolve().as_uri())
 

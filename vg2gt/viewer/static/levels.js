@@ -26,10 +26,12 @@ class Levels {
 
   // Whether a sphere around a tile reaches into the image.
   inView({ low, high, reach }, { axes, center }, lens, [width, height]) {
-    const offset = low.map((value, k) => (value + high[k]) / 2 - center[k]), [x, y, z] = axes.map((a) => dot(a, offset));
+    const offset = low.map((value, k) => (value + high[k]) / 2 - center[k]);
+    const [x, y, z] = axes.map((axis) => dot(axis, offset));
     const radius = Math.hypot(...addScaled(high, low, -1)) / 2 + reach;
     const outside = (side, slope) => (side - slope * z) / Math.hypot(1, slope) > radius;
-    return z + radius > this.near && !outside(x, (width - 0.5 - lens.cx) / lens.fx) && !outside(-x, (0.5 + lens.cx) / lens.fx)
+    return z + radius > this.near
+      && !outside(x, (width - 0.5 - lens.cx) / lens.fx) && !outside(-x, (0.5 + lens.cx) / lens.fx)
       && !outside(y, (height - 0.5 - lens.cy) / lens.fy) && !outside(-y, (0.5 + lens.cy) / lens.fy);
   }
 
@@ -70,16 +72,21 @@ class Levels {
     if (this.owners[slot]) this.owners[slot].slot = null;
     this.owners[slot] = tile;
     this.loading.add(tile);
+    tile.came = false;
     const script = document.createElement("script");
     script.src = `${encodeURIComponent(this.folder)}/${tile.k}-${tile.j}.js?${this.version}`;
-    script.onload = () => script.remove();
+    script.onload = () => {
+      script.remove();
+      if (!tile.came) this.done(tile, new Error(`A tile in ${this.folder} is damaged: run vg2gt view --levels again.`));
+    };
     script.onerror = () => this.done(tile, new Error(`The folder ${this.folder} of tiles is not next to the page.`));
     document.head.append(script);
   }
 
-  // First Gaussian of an asked tile.
-  first(k, j) {
-    return this.owners.indexOf(this.tiles[k][j]) * this.tile;
+  // First Gaussian of an asked tile, which has come.
+  first(tile) {
+    tile.came = true;
+    return this.owners.indexOf(tile) * this.tile;
   }
 
   done(tile, failed = null) {

@@ -17,7 +17,8 @@ async function start() {
   const { count, degree } = scene.gaussians, first = decodeGaussians(scene.gaussians, buffer);
   const levels = scene.levels && new Levels(scene.levels, scene.settings.near);
   const room = levels ? levels.owners.length * levels.tile : count;
-  const [means, geometry] = levels ? [new Float32Array(3 * room), new Float32Array(12 * room)] : [first.means, first.geometry];
+  const [means, geometry] = levels ? [3, 12].map((each) => new Float32Array(each * room))
+    : [first.means, first.geometry];
   const weights = levels ? new Float32Array(DRAWN) : weightsOf(geometry), detail = new Detail(weights);
   const renderer = new Renderer(canvas, scene.settings);
   renderer.allocate(room, degree);
@@ -119,12 +120,17 @@ async function start() {
       if (!busy) update();
     };
     window.vg2gtTile = async (k, j, header, text) => {
-      const tile = decodeGaussians(header, await inflate(text)), at = levels.first(k, j);
-      means.set(tile.means, 3 * at);
-      geometry.set(tile.geometry, 12 * at);
-      renderer.put(at, tile.geometry, tile.harmonics);
-      sorter.put(at, tile.means);
-      levels.done(levels.tiles[k][j]);
+      const tile = levels.tiles[k][j], at = levels.first(tile);
+      try {
+        const content = decodeGaussians(header, await inflate(text));
+        means.set(content.means, 3 * at);
+        geometry.set(content.geometry, 12 * at);
+        renderer.put(at, content.geometry, content.harmonics);
+        sorter.put(at, content.means);
+        levels.done(tile);
+      } catch (error) {
+        levels.done(tile, error);
+      }
     };
   }
   await follow(0);
@@ -171,7 +177,8 @@ function connect({ canvas, view, changed, resized, setCamera, show, records, sce
       changed();
     });
   }
-  const count = scene.levels?.total ?? scene.gaussians.count, counts = `${count.toLocaleString("en")} Gaussians, ${scene.cameras.length} cameras`;
+  const count = scene.levels?.total ?? scene.gaussians.count;
+  const counts = `${count.toLocaleString("en")} Gaussians, ${scene.cameras.length} cameras`;
   const follow = (otherwise) => {  // does what the address asks for; otherwise: the camera if it names none, null: stay
     const wanted = readAddress(location.hash, records.length);
     element("panel").hidden = !wanted.panel;

@@ -65,7 +65,8 @@ class Renderer {
 
   // Values from a Gaussian on whose row is its own; the last row is uploaded alone because it is shorter.
   fill({ texture, width, each }, first, values, channels, ...kind) {
-    const gl = this.gl, texels = values.length / channels, full = Math.floor(texels / width), top = first * each / width;
+    const gl = this.gl, texels = values.length / channels, full = Math.floor(texels / width);
+    const top = first * each / width;
     this.bind(0, texture);
     gl.pixelStorei(gl.UNPACK_ALIGNMENT, 2);
     gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, top, width, full, ...kind, values, 0);

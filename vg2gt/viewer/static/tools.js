@@ -66,7 +66,8 @@ function connectTools({ canvas, view, changed, renderer, scene, geometry, means,
     const moved = Math.hypot(clientX - start[0], clientY - start[1]) > CLICK;
     if (!element("measure").checked || moved) return;
     const lens = view.fitted(canvas.clientWidth, canvas.clientHeight);
-    const point = pointAt(geometry, view, lens, [offsetX - 0.5, offsetY - 0.5], { near, blur: lowpass, ranges: shown() });
+    const limits = { near, blur: lowpass, ranges: shown() };
+    const point = pointAt(geometry, view, lens, [offsetX - 0.5, offsetY - 0.5], limits);
     if (point) points = [...points.slice(-1), point];
     say(!point ? "There is no surface." : points.length < 2 ? "Click the second point."
       : measured(points, scene.cameras[0]?.metres_per_unit));
