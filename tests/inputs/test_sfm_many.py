@@ -86,6 +86,10 @@ def test_parts_are_named(photos: Path, tmp_path: Path, monkeypatch, caplog) -> N
     assert "1 of 4 images overlap too little with the others" in caplog.text
     assert "1 of them form a separate part with no overlap with the 3 images used" in caplog.text
     assert "reconstruct that part separately: IMG_11" in caplog.text
+    assert "look alike" not in caplog.text
+    (kept / "sfm.json").write_text(json.dumps(state | {"left_out": names[3:], "folded": 4}))
+    sfm.find_cameras(find_pictures(photos), kept, Monitor())
+    assert "sides of the scene look alike: with matches between them, which are removed, 4 images" in caplog.text
 
 
 def test_the_largest_model_with_points_comes_first(tmp_path: Path, monkeypatch) -> None:

@@ -114,6 +114,11 @@ def find_cameras(pictures: Sequence[Picture], folder: Path, monitor: Monitor) ->
             "%d of %d images overlap too little with the others; they have no cameras and are left out: %s",
             len(state["left_out"]), len(pictures), ", ".join(state["left_out"]),
         )  # fmt: skip
+    if state.get("folded", 0) > len(state["images"]):
+        log.warning(
+            "sides of the scene look alike: with matches between them, which are removed, %d images were placed, some "
+            "on top of each other. If too few are left, photograph in smaller steps, or mark one side", state["folded"],
+        )  # fmt: skip
     for part in state.get("other_parts", []):
         log.warning(
             "%d of them form a separate part with no overlap with the %d images used; take photographs in between, or "
@@ -179,6 +184,7 @@ def _solve(pictures: Sequence[Picture], folder: Path, key: str, monitor: Monitor
             raise ValueError(
                 f"cannot find the cameras of these {len(pictures)} images: {why_not_placed(matches)}; {ADVICE}"
             )
+        folded = models
         models, undecided = unfold(work / "database.db", matches, models, lambda: _map(work, len(names), monitor))
         placed, *others = _parts(models)
         _write(models[0], work)
@@ -190,6 +196,7 @@ def _solve(pictures: Sequence[Picture], folder: Path, key: str, monitor: Monitor
             "other_parts": [[titles[name] for name in sorted(part)] for part in others if part],
             "error": round(models[0].compute_mean_reprojection_error(), 2),
             "undecided": [titles[name] for name in undecided],
+            "folded": 0 if models is folded else len(folded[0].images),
         }
         with whole_folder(folder) as staged:
             for part in ("images", "sparse"):
