@@ -8,6 +8,7 @@ to 4 j + 3 of the level before.
 from __future__ import annotations
 
 import base64
+import functools
 import hashlib
 import json
 import re
@@ -70,7 +71,9 @@ def levels_of(gaussians: Gaussians) -> tuple[Gaussians, list[Gaussians]]:
     grid = (rest.means - low).double() / (high - low).max().clamp(min=1e-12) * (2**_BITS - 1)
     levels = [rest.select(hilbert_codes(grid.long(), _BITS).argsort())]
     while len(levels[-1]) > TILE - ALWAYS:
-        levels.append(merged(levels[-1]))
+        starts = range(0, len(levels[-1]), _GROUP * TILE)  # in parts, for memory
+        parts = (merged(levels[-1].select(slice(start, start + _GROUP * TILE))) for start in starts)
+        levels.append(functools.reduce(Gaussians.joined, parts))
     return gaussians.select(kept), levels
 
 
