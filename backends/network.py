@@ -34,7 +34,7 @@ def encode_pose(transform: Tensor, intrinsics: Tensor, size: tuple[int, int]) ->
     Channels: translation, quaternion (xyzw, w >= 0), vertical and horizontal field of view in rad.
     """
     quats = matrix_to_quat(transform[..., :3, :3])
-    fields = 2 * torch.atan(size_tensor(size, like=intrinsics) / 2 / intrinsics[..., [1, 0], [1, 0]])
+    fields = 2 * torch.atan(size_tensor(size, intrinsics.dtype, intrinsics.device) / 2 / intrinsics[..., [1, 0], [1, 0]])
     return torch.cat((transform[..., :3, 3], quats[..., [1, 2, 3, 0]], fields), -1)
 
 
@@ -49,7 +49,7 @@ def decode_pose(encoding: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor
     last[..., 3] = 1
     transform = torch.cat((top, last), -2)
 
-    half = size_tensor(size, like=encoding).flip(0) / 2
+    half = size_tensor(size, encoding.dtype, encoding.device).flip(0) / 2
     focal = half / torch.tan(encoding[..., [8, 7]] / 2).clamp_min(MIN_TANGENT)
     center = torch.cat((half, half.new_ones(1))).expand(*encoding.shape[:-1], 3)
     axes = torch.diag_embed(torch.cat((focal, torch.zeros_like(focal[..., :1])), -1))[..., :2]

@@ -115,7 +115,7 @@ class _Aggregator(nn.Module):
         count, start = x.shape[1], special.shape[1]
 
         # rotary tables
-        positions = grid_positions(*grid, like=x) + 1  # position 0 is for the special tokens
+        positions = grid_positions(*grid, x.device) + 1  # position 0 is for the special tokens
         positions = torch.cat((positions.new_zeros(start, 2), positions))
         frame_rotary = rotary_2d(positions, self.head_dim)
         global_rotary = tuple(table.repeat(views, 1) for table in frame_rotary)

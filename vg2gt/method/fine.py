@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from vg2gt.geometry.cameras import camera_centers, focal_lengths, unproject
-from vg2gt.geometry.precision import full_precision
+from vg2gt.geometry.precision import Float32Linear, full_precision
 from vg2gt.geometry.symmetric import UPPER
 from vg2gt.kernels.point_features import PooledFeatures
 from vg2gt.kernels.threads import compilable
@@ -100,7 +100,7 @@ class FineModule(nn.Module):
         self.cap = Cap("model.fine.max_voxels", max_voxels, "voxels", "least confident")
         self.dense_head = dense_head(token_dims=token_dims, patch_size=patch_size)
         width = self.dense_head.out_channels
-        self.point_offset = nn.Linear(3, width, bias=False)
+        self.point_offset = Float32Linear(3, width, bias=False)
         self.moments = moments
         self.normal_kernel = normal_kernel
         self.drop_fringes = drop_fringes

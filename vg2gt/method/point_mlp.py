@@ -7,6 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.utils.checkpoint import checkpoint
 
+from vg2gt.geometry.precision import Float32Linear
 from vg2gt.method.grid import scene_counts
 from vg2gt.method.serialization import Order, Windows, make_windows, relative_grid, serial_keys
 
@@ -42,7 +43,7 @@ class GeometricStage(nn.Module):
         super().__init__()
         self.alpha = nn.Parameter(torch.ones(channels + 3))
         self.beta = nn.Parameter(torch.zeros(channels + 3))
-        self.inner = nn.Linear(2 * channels + 3, channels)
+        self.inner = Float32Linear(2 * channels + 3, channels)
         self.before = _ResidualPointBlock(channels)
         self.after = _ResidualPointBlock(channels)
         self.out = nn.Linear(2 * channels, channels)

@@ -179,14 +179,14 @@ class _PTv3Block(nn.Module):
         conv, linear, norm = self.cpe
         x = conv(features if conv_input is None else conv_input, level.pairs[3])
         features = features + norm(linear(x))
-        features = features + self._drop(self.attn(self.norm1[0](features), level))
-        return features + self._drop(self.mlp[0](self.norm2[0](features)))
-
-    def _drop(self, branch: Tensor) -> Tensor:
+        attended = self.attn(self.norm1[0](features), level)
         if not (self.training and self.drop_path):
-            return branch
-        kept = torch.rand(len(branch), 1, device=branch.device) >= self.drop_path
-        return branch * kept / (1 - self.drop_path)
+            features = features + attended
+            return features + self.mlp[0](self.norm2[0](features))
+        share = 1 - self.drop_path  # of the voxels that keep a branch, which is scaled to the same mean
+        kept = torch.empty(2, len(features), 1, device=features.device).bernoulli_(share) / share
+        features = features + attended * kept[0]
+        return features + self.mlp[0](self.norm2[0](features)) * kept[1]
 
 
 class _GridPool(nn.Module):

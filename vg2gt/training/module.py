@@ -23,6 +23,7 @@ from vg2gt.model import VG2GT, Reconstructor
 from vg2gt.profiling import stage
 from vg2gt.rendering import Renderer, UnrenderableError
 from vg2gt.runs.checkpoints import MADE_OF, MODEL_PREFIX, model_state
+from vg2gt.training.casts import WeightCasts
 from vg2gt.training.distributed import SkippedSteps, all_gather_object, finite, world_size
 from vg2gt.types import Batch, Prediction
 
@@ -91,6 +92,7 @@ class VG2GTModule(lightning.LightningModule):
         self.part = part
         if part == "coarse":
             _leave_only_coarse(model)
+        self.casts = WeightCasts(model)
         self.pose_noise = pose_noise
         self.loss = loss
         self.renderer = renderer
@@ -122,7 +124,8 @@ class VG2GTModule(lightning.LightningModule):
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Returns the training loss; NaN if the batch, prediction or loss is bad, and all ranks then skip the step."""
         self._scenes, self._figures, self._cause = batch.scene, {}, None
-        report = self._losses(batch)
+        with self.casts(batch.images):
+            report = self._losses(batch)
         if report is not None:
             self._figures |= self._step_figures(report)
             if finite(report.total):
