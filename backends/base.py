@@ -127,7 +127,7 @@ class Backend(nn.Module, ABC):
             size = f"image size {height}x{width} is not a multiple of the patch size {self.patch_size}"
             raise ValueError(f"{size} of backend {self.name}: resize or crop the images")
         low, high = torch.aminmax(images)
-        if not (low >= 0 and high <= 1):  # also catches NaN
+        if not ((low >= 0) & (high <= 1)):  # one value to wait for; also catches NaN
             raise ValueError(f"images must be finite and in [0, 1], got {float(low):.4g} to {float(high):.4g}")
 
     def as_tokens(self, images: Tensor, patch: Sequence[Tensor], camera: Tensor) -> Tokens:

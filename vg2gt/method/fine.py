@@ -141,7 +141,7 @@ class FineModule(nn.Module):
         # pixels to points and their cells
         with full_precision(images):
             points = _Points(geometry, size, self.drop_fringes)
-            plan = plan_voxels(points.cells, points.batch, points.valid)
+            plan = plan_voxels(points.cells, points.batch, points.valid, points.valid_count)
             note_sizes({"voxels": len(plan)})
             if capped and self.cap.limit is not None:
                 keep = self.cap(pool_min(points.confidence.detach(), plan), plan.batch)
@@ -246,7 +246,7 @@ class _Points:
         near = in_range(self.cells.detach())
         self.valid = usable.flatten() & near
         self.offset = (self.cells - self.cells.detach().floor() - 0.5).float()
-        far = int((usable.flatten() & ~near).sum())
+        far, self.valid_count = torch.stack(((usable.flatten() & ~near).sum(), self.valid.sum())).tolist()
         if far:
             log.warning("ignored %d of %d points: too far from the origin for the voxel grid", far, usable.numel())
 

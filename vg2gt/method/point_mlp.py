@@ -140,9 +140,7 @@ class PointMLP(nn.Module):
 
     def _windows(self, grid: Tensor, batch: Tensor, voxel_size: Tensor) -> list[Windows]:
         orders = STAGE_ORDERS[: len(self.stages)]
-        counts = scene_counts(batch, len(voxel_size)).tolist()
-        curves = [torch.argsort(key) for key in serial_keys(grid, batch, voxel_size, orders)]
-        return [
-            make_windows(curves[i % len(curves)], counts, self.window, self.window // 2 * (i % 2))
-            for i in range(len(self.stages))
-        ]
+        *counts, last = torch.cat((scene_counts(batch, len(voxel_size)), grid.max()[None])).tolist()
+        curves = [torch.argsort(key) for key in serial_keys(grid, batch, voxel_size, orders, extent=last + 1)]
+        windows = [make_windows(counts, self.window, grid.device, shift) for shift in (0, self.window // 2)]
+        return [windows[i % 2].along(curves[i % len(curves)]) for i in range(len(self.stages))]
