@@ -88,6 +88,15 @@ class Backend(nn.Module, ABC):
             Depth, confidence and raw cameras; depth and confidence are differentiable with respect to ``tokens.patch``.
         """
 
+    def decode_again(self, tokens: Tokens, cameras: Cameras) -> Geometry:
+        """Decodes modified patch tokens with a camera token that was decoded before.
+
+        Args:
+            tokens: as for :meth:`decode`.
+            cameras: raw cameras of the camera token; an override may return them instead of decoding them again.
+        """
+        return self.decode(tokens)
+
     def decode_cameras(self, tokens: Tokens) -> Cameras:
         """Returns the raw cameras of :meth:`decode`, bit-equal; cheaper if the network has a camera head."""
         return self.decode(tokens).cameras

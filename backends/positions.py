@@ -18,7 +18,7 @@ Table = TypeVar("Table")
 
 
 def remembered(make: Callable[Arguments, Table]) -> Callable[Arguments, Table]:
-    """Keeps the last tables of a function of sizes, dtype and device; an export, whose sizes are free, makes its own."""
+    """Keeps the last tables made from sizes, dtype and device; an export, whose sizes are free, makes its own."""
     # tables first made in inference mode must not be inference tensors, as a trained network saves them for backward
     kept = lru_cache(maxsize=32)(torch.inference_mode(False)(make))
 

@@ -157,9 +157,9 @@ class VGGTDecoder(nn.Module):
         self.camera_head = _CameraHead(token_dim, camera_depth, camera_heads)
         self.depth_head = DPT(token_dim, features, out_channels, 2, patch_size, rectified_skip=True)
 
-    def decode(self, tokens: Tokens, chunk: int | None) -> Geometry:
+    def decode(self, tokens: Tokens, chunk: int | None, cameras: Cameras | None = None) -> Geometry:
         """See :meth:`Backend.decode`; the depth head runs on at most ``chunk`` views at a time."""
-        return decode_geometry(self.depth_head, tokens, self.decode_cameras(tokens), chunk)
+        return decode_geometry(self.depth_head, tokens, cameras or self.decode_cameras(tokens), chunk)
 
     def decode_cameras(self, tokens: Tokens) -> Cameras:
         """See :meth:`Backend.decode_cameras`."""

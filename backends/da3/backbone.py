@@ -121,9 +121,7 @@ class Backbone(nn.Module):
 
 
 @remembered
-def _rotary_tables(
-    grid: tuple[int, int], views: int, head_dim: int, device: torch.device
-) -> tuple[Rotary, Rotary]:
+def _rotary_tables(grid: tuple[int, int], views: int, head_dim: int, device: torch.device) -> tuple[Rotary, Rotary]:
     """Tables within views (patch positions from 1) and across views (all patches at (1, 1)); class token at 0."""
     patches = grid_positions(*grid, device) + 1
     special = patches.new_zeros(1, 2)

@@ -178,11 +178,9 @@ def _search(queries: Tensor, batch: Tensor, radius: Tensor, curves: _Curves, ind
         last = torch.searchsorted(ends, cuts) + 1  # [parts - 1]: number of queries up to and including each cut
         bounds[1:1] = torch.stack((last, ends[last - 1]), -1).tolist()
     for (begin, before), (end, after) in itertools.pairwise(bounds):
-        part = slice(begin, end)
         if begin < end:
-            _nearest(
-                queries[part], radius[part], starts[part], counts[part], after - before, curves, index[part], found[part]
-            )
+            each = (tensor[begin:end] for tensor in (queries, radius, starts, counts, index, found))
+            _nearest(*each, after - before, curves)
 
 
 def _ranges(queries: Tensor, batch: Tensor, radius: Tensor, curves: _Curves) -> tuple[Tensor, Tensor]:
@@ -204,10 +202,10 @@ def _nearest(
     radius: Tensor,
     starts: Tensor,
     counts: Tensor,
-    total: int,
-    curves: _Curves,
     index: Tensor,
     found: Tensor,
+    total: int,
+    curves: _Curves,
 ) -> None:
     """Writes the nearest points in the ranges ``[N, 27]`` of each query; the ranges hold ``total`` points in all."""
     sizes = counts.flatten()

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -32,7 +33,7 @@ class TaskLoss:
     reg: Tensor
     grad: Tensor
 
-    @property
+    @cached_property
     def total(self) -> Tensor:
         """``conf + reg + grad``."""
         return self.conf + self.reg + self.grad

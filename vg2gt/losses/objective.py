@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TypeVar
 
 import torch
@@ -167,12 +167,12 @@ class VG2GTLoss(nn.Module):
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Weighted sum and terms ``[B]`` of the geometry and enhancement losses, all in the truth's unit."""
         # one pass for both, as a GPU spends most of its time here on launches
-        tasks = self.geometry(*_stacked(before, after), truth, valid)
-        (depth_before, point_before), (depth, point) = ([task[i] for task in tasks] for i in range(2))
+        both = self.geometry(*_stacked(before, after), truth, valid)
+        (depth_before, point_before), (depth, point) = ([task[i] for task in both] for i in range(2))
         hinge_depth, hinge_point = self.enhance(depth_before, depth), self.enhance(point_before, point)
         total = self.geometry.depth * depth.total + self.geometry.point * point.total
-        terms = {f"depth_{part}": value for part, value in vars(depth).items()}
-        terms |= {f"point_{part}": value for part, value in vars(point).items()}
+        terms = {f"depth_{part.name}": getattr(depth, part.name) for part in fields(TaskLoss)}
+        terms |= {f"point_{part.name}": getattr(point, part.name) for part in fields(TaskLoss)}
         terms |= {"enhance_depth": hinge_depth, "enhance_point": hinge_point}
         terms |= {"initial_depth": self.enhance.compared(depth_before)}
         terms |= {"initial_point": self.enhance.compared(point_before)}

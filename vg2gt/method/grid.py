@@ -116,9 +116,7 @@ def in_range(cells: Tensor) -> Tensor:
     return (cells.abs() < MAX_CELLS).all(-1)
 
 
-def plan_voxels(
-    cells: Tensor, batch: Tensor, valid: Tensor | None = None, valid_count: int | None = None
-) -> VoxelPlan:
+def plan_voxels(cells: Tensor, batch: Tensor, valid: Tensor | None = None, valid_count: int | None = None) -> VoxelPlan:
     """Groups points by cell.
 
     Args:

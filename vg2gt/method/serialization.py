@@ -99,7 +99,6 @@ class Windows:
     groups: tuple[_WindowGroup, ...]
     owner: Tensor
 
-
     def along(self, order: Tensor) -> Windows:
         """Returns windows of positions on a curve as windows of the voxels ``order`` ``[M]`` along it."""
         groups = tuple(_WindowGroup(order[group.rows], group.counts) for group in self.groups)
@@ -127,12 +126,16 @@ def make_windows(counts: list[int], length: int, device: torch.device, shift: in
         rows = []
         for begin, count in scenes:
             first = -shift if count > length else 0
-            inside = torch.arange(first, count, size, device=device).clamp(0, count - size)  # [W]
+            starts = torch.arange(first, count, size, device=device)  # [W]
+            inside = starts.clamp(0, count - size)
+            moved = starts - inside + (base - first)  # from a place in the scene to one in the windows
             place = torch.arange(count, device=device)
-            window = (place - first) // size
-            owners[begin] = base + window * size + place - inside[window]
-            rows.append(begin + inside[:, None] + torch.arange(size, device=device))  # [W, K]
+            owners[begin] = place + moved[(place - first) // size]
+            rows.append((inside + begin)[:, None] + torch.arange(size, device=device))  # [W, K]
             base += len(inside) * size
-        groups.append(_WindowGroup(torch.cat(rows), tuple(map(len, rows))))
-    in_order = [owners[begin] for begin in sorted(owners)]
-    return Windows(tuple(groups), torch.cat(in_order) if in_order else torch.empty(0, dtype=torch.int64, device=device))
+        groups.append(_WindowGroup(_cat(rows), tuple(map(len, rows))))
+    return Windows(tuple(groups), _cat([owners[begin] for begin in sorted(owners)]))
+
+
+def _cat(parts: list[Tensor]) -> Tensor:
+    return parts[0] if len(parts) == 1 else torch.cat(parts)

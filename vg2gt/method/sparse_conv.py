@@ -89,9 +89,9 @@ def neighbor_tables(cells: Sequence[Cells]) -> list[NeighborTable]:
     for sets in alike.values():
         for index, rows in zip(sets, _rows_of_sets([cells[index] for index in sets]), strict=True):
             found[index] = rows
-    most = torch.stack([there.sum(1).amax() if there.numel() else there.new_zeros((), dtype=torch.int64)
-                        for there in (rows < rows.shape[1] for rows in found)])  # fmt: skip
-    return [_tabulate(rows, most) for rows, most in zip(found, most.tolist(), strict=True)]
+    ranks = [(rows < rows.shape[1]).cumsum(1) for rows in found]  # of the voxels that have a neighbour at an offset
+    most = [rank[:, -1].amax() if rank.numel() else rank.new_zeros(()) for rank in ranks]
+    return [_tabulate(*each) for each in zip(found, ranks, torch.stack(most).tolist(), strict=True)]
 
 
 def _rows_of_sets(cells: Sequence[Cells]) -> list[Tensor]:
@@ -123,15 +123,15 @@ def _neighbor_rows(grid: Tensor, batch: Tensor, kernel_size: int, spans: Sequenc
     return torch.cat((before, after.flip(0)))
 
 
-def _tabulate(rows: Tensor, most: int) -> NeighborTable:
-    """Builds the table from neighbour rows ``[T, M]``, with at most ``most`` neighbours per offset."""
+def _tabulate(rows: Tensor, ranks: Tensor, most: int) -> NeighborTable:
+    """Builds the table from neighbour rows and their ranks ``[T, M]``, with at most ``most`` neighbours per offset."""
     offsets, count = rows.shape
-    there = rows < count
-    column = torch.where(there, there.cumsum(1) - 1, most)
+    column = torch.where(rows < count, ranks - 1, most)
     sources, targets = (rows.new_full((offsets, most + 1), count) for _ in range(2))
     sources.scatter_(1, column, rows)
     voxels = torch.arange(count, device=rows.device)
-    targets.scatter_(1, column, torch.where(there, voxels, count))
+    targets.scatter_(1, column, voxels.expand(offsets, -1))
+    targets[:, -1] = count
     # a last column for voxels that are nobody's neighbour; whose neighbour a voxel is, the opposite offset tells
     slots = F.pad(column, (0, 1), value=most) + (most + 1) * torch.arange(offsets, device=rows.device)[:, None]
     back = slots.gather(1, rows.flip(0))
@@ -183,33 +183,37 @@ class _BatchedConvolution(torch.autograd.Function):
     """Gathers, multiplies and sums many kernel offsets at once; the backward pass gathers again."""
 
     @staticmethod
-    def forward(ctx: Any, features: Tensor, weight: Tensor, table: NeighborTable) -> Tensor:
-        """Returns ``[M, out]`` for ``features [M, in]`` and ``weight [out, k, k, k, in]``."""
+    def forward(ctx: Any, features: Tensor, weight: Tensor, bias: Tensor | None, table: NeighborTable) -> Tensor:
+        """Returns ``[M, out]`` for ``features [M, in]``, ``weight [out, k, k, k, in]`` and ``bias [out]``.
+
+        Products have the dtype of the weight, sums that of the features.
+        """
         taps, center = _taps(weight)
-        out = _in_full(features @ center)
-        padded = F.pad(features, (0, 0, 0, 1))
+        padded = _padded(features, weight.dtype)
+        product = padded[:-1] @ center
+        out = product.to(features.dtype) if bias is None else product + bias
         for some in table.parts(taps.shape[1] + taps.shape[2]):
             out += table.sums(padded[table.sources[some]] @ taps[some], table.slots, some)
         ctx.save_for_backward(padded, weight)
-        ctx.table = table
+        ctx.table, ctx.dtype = table, features.dtype
         return out
 
     @staticmethod
-    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, Tensor, None]:  # pyright: ignore
-        """Returns the gradients of the features and the weight."""
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore
+        """Returns the gradients of the features, the weight and the bias."""
         padded, weight = ctx.saved_tensors
         table: NeighborTable = ctx.table
-        features, grad = padded[:-1], grad_outputs[0].to(padded.dtype)
+        padded_grad = _padded(grad_outputs[0], padded.dtype)
+        features, grad = padded[:-1], padded_grad[:-1]
         taps, center = _taps(weight)
-        grad_features, of_taps = _in_full(grad @ center.t()), []
-        padded_grad = F.pad(grad, (0, 0, 0, 1))
+        grad_features, of_taps = (grad @ center.t()).to(ctx.dtype), []
         for some in table.parts(grad.shape[1] + features.shape[1]):
             rows, grad_rows = padded[table.sources[some]], padded_grad[table.targets[some]]  # [t, P + 1, in or out]
             of_taps += (rows.mT @ grad_rows).unbind()
             grad_features += table.sums(grad_rows @ taps[some].mT, table.back, some)
         of_taps.insert(len(of_taps) // 2, features.t() @ grad)
         of_weight = torch.stack(of_taps).permute(2, 0, 1).reshape(weight.shape)  # from [k^3, in, out]
-        return grad_features.to(features.dtype), of_weight, None
+        return grad_features, of_weight, grad_outputs[0].sum(0) if ctx.needs_input_grad[2] else None, None
 
 
 def _taps(weight: Tensor) -> tuple[Tensor, Tensor]:
@@ -219,9 +223,11 @@ def _taps(weight: Tensor) -> tuple[Tensor, Tensor]:
     return torch.cat((taps[:half], taps[half + 1 :])), taps[half]
 
 
-def _in_full(sums: Tensor) -> Tensor:
-    """Converts to float32 or better, for sums."""
-    return sums.to(torch.promote_types(sums.dtype, torch.float32))
+def _padded(rows: Tensor, dtype: torch.dtype) -> Tensor:
+    """Converts rows ``[M, C]`` and appends one of zeros."""
+    padded = rows.new_zeros(len(rows) + 1, rows.shape[1], dtype=dtype)
+    padded[:-1] = rows
+    return padded
 
 
 class _SubmanifoldConvolution(torch.autograd.Function):
@@ -291,7 +297,9 @@ class SubmanifoldConv3d(nn.Module):
         """
         weight = self.weight
         if torch.is_autocast_enabled(features.device.type):
-            features, weight = features.to(autocast_dtype(features)), weight.to(autocast_dtype(features))
-        convolve = _BatchedConvolution if isinstance(pairs, NeighborTable) else _SubmanifoldConvolution
-        out: Tensor = convolve.apply(features, weight, pairs)  # pyright: ignore
+            weight = weight.to(autocast_dtype(features))
+        if isinstance(pairs, NeighborTable):
+            features = features.to(torch.promote_types(features.dtype, torch.float32))
+            return _BatchedConvolution.apply(features, weight, self.bias, pairs)  # pyright: ignore
+        out: Tensor = _SubmanifoldConvolution.apply(features.to(weight.dtype), weight, pairs)  # pyright: ignore
         return out if self.bias is None else out + self.bias
