@@ -15,7 +15,6 @@ from vg2gt.training.module import VG2GTModule
 MODELS = [
     pytest.param(("experiment=paper", "backend=oracle", *NARROW), id="paper"),
     pytest.param(("model=tiny",), id="tiny"),
-    pytest.param(("model=pixel_aligned",), id="pixel_aligned"),
     pytest.param(("model=tiny", "backend=da3_tiny", "backend.freeze=false"), id="trained backbone"),
 ]
 

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from vg2gt.geometry.precision import autocast_dtype
 from vg2gt.method.sparse_conv import SubmanifoldConv3d
 
+CONTAINERS = (nn.Sequential, nn.ModuleList, nn.ModuleDict)
 _BOTH = ("weight", "bias")
 CAST = {nn.Linear: _BOTH, nn.Conv2d: _BOTH, nn.ConvTranspose2d: _BOTH, SubmanifoldConv3d: ("weight",)}
 """What autocast casts, for exactly these types: subclasses, such as
@@ -19,11 +20,11 @@ CAST = {nn.Linear: _BOTH, nn.Conv2d: _BOTH, nn.ConvTranspose2d: _BOTH, Submanifo
 
 
 class WeightCasts:
-    """Casts the trained weights of a model's linear layers and convolutions before a training step.
+    """Casts the trained weights of the method's linear layers and convolutions before a training step.
 
     Values and gradients are those of autocast to the bit. A part is a module two levels down, such as ``coarse.ptv3``:
-    its weights get their gradients together, so that DDP still exchanges them during the backward pass. Weights of the
-    backbone are left out: it decides on its own precision.
+    its weights get their gradients together, so that DDP still exchanges them during the backward pass. Only modules of
+    :mod:`vg2gt.method` take part: others, such as the backbone, may run in float32.
 
     Args:
         model: the model; its trained parameters must require gradients already.
@@ -31,11 +32,10 @@ class WeightCasts:
 
     def __init__(self, model: nn.Module) -> None:
         self.parts: dict[str, list[tuple[nn.Module, str]]] = {}
-        for name, module in model.named_modules():
-            part = ".".join(name.split(".")[:2])
-            for key in () if part.startswith("backend.") else CAST.get(type(module), ()):
+        for name, module in _layers(model):
+            for key in CAST[type(module)]:
                 if (weight := module._parameters[key]) is not None and weight.requires_grad:
-                    self.parts.setdefault(part, []).append((module, key))
+                    self.parts.setdefault(".".join(name.split(".")[:2]), []).append((module, key))
 
     @contextmanager
     def __call__(self, like: Tensor) -> Iterator[None]:
@@ -57,6 +57,15 @@ class WeightCasts:
         finally:
             for (module, key), weight in zip(slots, weights, strict=True):
                 module._parameters[key] = weight
+
+
+def _layers(module: nn.Module, prefix: str = "") -> Iterator[tuple[str, nn.Module]]:
+    """Returns names and layers of :data:`CAST` in torch's containers and modules of the method."""
+    for name, child in module.named_children():
+        if type(child) in CAST:
+            yield prefix + name, child
+        elif isinstance(child, CONTAINERS) or type(child).__module__.startswith("vg2gt.method."):
+            yield from _layers(child, f"{prefix}{name}.")
 
 
 class _Cast(torch.autograd.Function):
