@@ -33,7 +33,7 @@ PACKAGE = "vg2gt"
 KERNELS = {
     **dict.fromkeys(("empty", "empty_like", "empty_strided", "new_empty", "new_empty_strided"), 0),
     **dict.fromkeys(("_unsafe_view", "promote_types", "_local_scalar_dense"), 0),
-    **dict.fromkeys(("constant_pad_nd", "slice_backward", "select_backward", "index_add"), 2),
+    **dict.fromkeys(("constant_pad_nd", "slice_backward", "select_backward"), 2),
 }
 TENSORS = 30  # that a multi-tensor kernel takes at least
 

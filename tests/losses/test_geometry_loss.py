@@ -106,7 +106,7 @@ def test_scenes_and_predictions_together_equal_each_alone(sample, on_gpu: bool) 
             values = torch.stack([torch.cat([getattr(scene[task], part) for scene in one]) for one in each])
             torch.testing.assert_close(getattr(found[task], part), values, rtol=1e-12, atol=1e-14)
     (found[0].total.sum() + found[1].total.sum()).backward()
-    sum(task.total.sum() for one in each for scene in one for task in scene).backward()
+    torch.cat([task.total for one in each for scene in one for task in scene]).sum().backward()
     for one, other in zip(together, alone, strict=True):
         torch.testing.assert_close(one.grad, other.grad, rtol=1e-9, atol=1e-14)
 

@@ -179,8 +179,9 @@ def _search(queries: Tensor, batch: Tensor, radius: Tensor, curves: _Curves, ind
         bounds[1:1] = torch.stack((last, ends[last - 1]), -1).tolist()
     for (begin, before), (end, after) in itertools.pairwise(bounds):
         if begin < end:
-            each = (tensor[begin:end] for tensor in (queries, radius, starts, counts, index, found))
-            _nearest(*each, after - before, curves)
+            part = slice(begin, end)
+            inputs = (queries[part], radius[part], starts[part], counts[part], index[part], found[part])
+            _nearest(*inputs, after - before, curves)
 
 
 def _ranges(queries: Tensor, batch: Tensor, radius: Tensor, curves: _Curves) -> tuple[Tensor, Tensor]:
