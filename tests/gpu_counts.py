@@ -1,4 +1,4 @@
-"""Counts what a step asks of a GPU, on a CPU: operations, and waits of the host for a value from the device.
+"""Counts what a step asks of a GPU, on a CPU: kernels, and waits of the host for a value from the device.
 
 Counts of waits are lower bounds: operations that wait twice internally count once (except ``bincount``), and copies to
 the device are not counted.
@@ -148,7 +148,7 @@ RENDER = Counter({"the renderer's operations and kernels": 33})
 
 
 def count_step(step: Callable[[], Any]) -> tuple[Counter[str], Counter[str]]:
-    """Operations and waits of a training step on a GPU; the renderer counts as ``RENDER`` and one wait."""
+    """Kernels and waits of a training step on a GPU; the renderer counts as ``RENDER`` and one wait."""
     from vg2gt.method import serialization
     from vg2gt.profiling import listening
 
