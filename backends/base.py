@@ -88,6 +88,15 @@ class Backend(nn.Module, ABC):
             Depth, confidence and raw cameras; depth and confidence are differentiable with respect to ``tokens.patch``.
         """
 
+    def decode_again(self, tokens: Tokens, cameras: Cameras) -> Geometry:
+        """Decodes modified patch tokens with a camera token that was decoded before.
+
+        Args:
+            tokens: as for :meth:`decode`.
+            cameras: raw cameras of the camera token; an override may return them instead of decoding them again.
+        """
+        return self.decode(tokens)
+
     def decode_cameras(self, tokens: Tokens) -> Cameras:
         """Returns the raw cameras of :meth:`decode`, bit-equal; cheaper if the network has a camera head."""
         return self.decode(tokens).cameras
@@ -127,7 +136,7 @@ class Backend(nn.Module, ABC):
             size = f"image size {height}x{width} is not a multiple of the patch size {self.patch_size}"
             raise ValueError(f"{size} of backend {self.name}: resize or crop the images")
         low, high = torch.aminmax(images)
-        if not (low >= 0 and high <= 1):  # also catches NaN
+        if not ((low >= 0) & (high <= 1)):  # one value to wait for; also catches NaN
             raise ValueError(f"images must be finite and in [0, 1], got {float(low):.4g} to {float(high):.4g}")
 
     def as_tokens(self, images: Tensor, patch: Sequence[Tensor], camera: Tensor) -> Tokens:

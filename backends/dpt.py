@@ -136,7 +136,8 @@ class DPT(nn.Module):
     def _add_position(self, x: Tensor, image_size: tuple[int, int]) -> Tensor:
         if self.position_weight == 0:
             return x
-        return x + self.position_weight * uv_embedding(x.shape[1], (x.shape[-2], x.shape[-1]), image_size, like=x)
+        size = (x.shape[-2], x.shape[-1])
+        return x + uv_embedding(x.shape[1], size, image_size, self.position_weight, like=x)
 
 
 def in_chunks(head: nn.Module, tokens: Sequence[Tensor], grid: tuple[int, int], chunk: int | None) -> Tensor:

@@ -34,7 +34,8 @@ def encode_pose(transform: Tensor, intrinsics: Tensor, size: tuple[int, int]) ->
     Channels: translation, quaternion (xyzw, w >= 0), vertical and horizontal field of view in rad.
     """
     quats = matrix_to_quat(transform[..., :3, :3])
-    fields = 2 * torch.atan(size_tensor(size, like=intrinsics) / 2 / intrinsics[..., [1, 0], [1, 0]])
+    edges = size_tensor(size, intrinsics.dtype, intrinsics.device)
+    fields = 2 * torch.atan(edges / 2 / intrinsics[..., [1, 0], [1, 0]])
     return torch.cat((transform[..., :3, 3], quats[..., [1, 2, 3, 0]], fields), -1)
 
 
@@ -49,7 +50,7 @@ def decode_pose(encoding: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor
     last[..., 3] = 1
     transform = torch.cat((top, last), -2)
 
-    half = size_tensor(size, like=encoding).flip(0) / 2
+    half = size_tensor(size, encoding.dtype, encoding.device).flip(0) / 2
     focal = half / torch.tan(encoding[..., [8, 7]] / 2).clamp_min(MIN_TANGENT)
     center = torch.cat((half, half.new_ones(1))).expand(*encoding.shape[:-1], 3)
     axes = torch.diag_embed(torch.cat((focal, torch.zeros_like(focal[..., :1])), -1))[..., :2]
@@ -135,6 +136,10 @@ class NetworkBackend(Backend):
     def decode(self, tokens: Tokens) -> Geometry:
         """See :meth:`Backend.decode`; the principal point is (W/2, H/2)."""
         return self.network.decode(tokens, self.head_chunk)
+
+    def decode_again(self, tokens: Tokens, cameras: Cameras) -> Geometry:
+        """See :meth:`Backend.decode_again`; decodes depth and confidence only."""
+        return self.network.decode(tokens, self.head_chunk, cameras)
 
     def decode_cameras(self, tokens: Tokens) -> Cameras:
         """See :meth:`Backend.decode_cameras`; does not run the depth head."""

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
+from collections.abc import Callable
+from functools import lru_cache, wraps
+from typing import Literal, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
@@ -11,6 +13,20 @@ from torch import Tensor
 from vg2gt.geometry.precision import full_precision
 
 Resampling = Literal["size", "scale"]
+Arguments = ParamSpec("Arguments")
+Table = TypeVar("Table")
+
+
+def remembered(make: Callable[Arguments, Table]) -> Callable[Arguments, Table]:
+    """Keeps the last tables made from sizes, dtype and device; an export, whose sizes are free, makes its own."""
+    # tables first made in inference mode must not be inference tensors, as a trained network saves them for backward
+    kept = lru_cache(maxsize=32)(torch.inference_mode(False)(make))
+
+    @wraps(make)
+    def table(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Table:
+        return (make if torch.compiler.is_compiling() else kept)(*args, **kwargs)
+
+    return table
 
 
 def resize_position_embedding(embedding: Tensor, grid: tuple[int, int], resampling: Resampling) -> Tensor:
@@ -26,22 +42,29 @@ def resize_position_embedding(embedding: Tensor, grid: tuple[int, int], resampli
         ``[rows * columns, C]``.
     """
     side = math.isqrt(int(embedding.shape[0]))
-    rows, columns = (torch.ones(size, device=embedding.device, dtype=embedding.dtype).cumsum(0) - 0.5 for size in grid)
-    if resampling == "size":
-        weights = [_antialiased_weights(centers, side) for centers in (rows, columns)]
-    else:
-        # Compare as tensors: a Python comparison would fix the sizes in an export.
-        native = (rows[-1] + 0.5 == side) & (columns[-1] + 0.5 == side)
-        offset = torch.where(native, 0.0, 0.1)
-        weights = [_clamped_weights(centers, offset, side) for centers in (rows, columns)]
+    weights = _resize_weights(side, grid, resampling, embedding.dtype, embedding.device)
     values = embedding.unflatten(0, (side, side))
     with full_precision(embedding):
         return torch.einsum("hy,wx,yxc->hwc", weights[0], weights[1], values).flatten(0, 1)
 
 
-def size_tensor(size: tuple[int, int], like: Tensor) -> Tensor:
+@remembered
+def _resize_weights(
+    side: int, grid: tuple[int, int], resampling: Resampling, dtype: torch.dtype, device: torch.device
+) -> tuple[Tensor, Tensor]:
+    """Weights ``[rows, side]`` and ``[columns, side]`` of :func:`resize_position_embedding`."""
+    rows, columns = (torch.ones(size, device=device, dtype=dtype).cumsum(0) - 0.5 for size in grid)
+    if resampling == "size":
+        return _antialiased_weights(rows, side), _antialiased_weights(columns, side)
+    # Compare as tensors: a Python comparison would fix the sizes in an export.
+    native = (rows[-1] + 0.5 == side) & (columns[-1] + 0.5 == side)
+    offset = torch.where(native, 0.0, 0.1)
+    return _clamped_weights(rows, offset, side), _clamped_weights(columns, offset, side)
+
+
+def size_tensor(size: tuple[int, int], dtype: torch.dtype, device: torch.device) -> Tensor:
     """Returns ``size`` as a tensor ``[2]`` without reading its values, which would fix them in an export."""
-    return torch.stack([torch.full((), length, dtype=like.dtype, device=like.device) for length in size])
+    return torch.stack([torch.full((), length, dtype=dtype, device=device) for length in size])
 
 
 def _cubic(distance: Tensor, a: float) -> Tensor:
@@ -70,7 +93,9 @@ def _clamped_weights(centers: Tensor, offset: Tensor, side: int) -> Tensor:
     return torch.cat((first, weights[:, 3:-3], last), 1)
 
 
-def uv_embedding(channels: int, size: tuple[int, int], image_size: tuple[int, int], like: Tensor) -> Tensor:
+def uv_embedding(
+    channels: int, size: tuple[int, int], image_size: tuple[int, int], weight: float, like: Tensor
+) -> Tensor:
     """Returns a sine-cosine embedding ``[channels, h, w]`` of normalised image coordinates.
 
     Coordinates are those of pixel centres, normalised so that half the diagonal of ``image_size`` is 1. Wavelengths
@@ -80,30 +105,44 @@ def uv_embedding(channels: int, size: tuple[int, int], image_size: tuple[int, in
         channels: number of channels, a multiple of 4; half of them for each axis.
         size: size ``(h, w)`` of the embedding.
         image_size: image ``(height, width)``.
+        weight: factor on all values.
         like: tensor whose dtype and device to use.
     """
-    extent = size_tensor(image_size, like).double()
-    y_extent, x_extent = (extent / extent.norm()).unbind()
-    y, x = (
-        (2 * torch.arange(length, device=like.device, dtype=torch.float64) + 1) / length - 1  # pixel centres
-        for length in size
-    )
-    quarter = channels // 4
-    omega = 100.0 ** (-torch.arange(quarter, device=like.device, dtype=torch.float64) / quarter)
-    columns, rows = omega[:, None, None] * (x * x_extent), omega[:, None, None] * (y * y_extent)[:, None]
     # Waves are constant along the other axis: compute them once, then expand.
-    waves = [torch.cat((phase.sin(), phase.cos())).to(like.dtype) for phase in (columns, rows)]
+    waves = _uv_waves(channels, size, image_size, weight, like.dtype, like.device)
     return torch.cat([wave.expand(-1, *size) for wave in waves])
 
 
+@remembered
+def _uv_waves(
+    channels: int,
+    size: tuple[int, int],
+    image_size: tuple[int, int],
+    weight: float,
+    dtype: torch.dtype,
+    device: torch.device,
+) -> list[Tensor]:
+    """Waves ``[channels / 2, 1, w]`` and ``[channels / 2, h, 1]`` of :func:`uv_embedding`."""
+    extent = size_tensor(image_size, dtype, device).double()
+    y_extent, x_extent = (extent / extent.norm()).unbind()
+    y, x = (
+        (2 * torch.arange(length, device=device, dtype=torch.float64) + 1) / length - 1  # pixel centres
+        for length in size
+    )
+    quarter = channels // 4
+    omega = 100.0 ** (-torch.arange(quarter, device=device, dtype=torch.float64) / quarter)
+    columns, rows = omega[:, None, None] * (x * x_extent), omega[:, None, None] * (y * y_extent)[:, None]
+    return [weight * torch.cat((phase.sin(), phase.cos())).to(dtype) for phase in (columns, rows)]
+
+
 Rotary = tuple[Tensor, Tensor]
-"""Cosines and sines of a rotary embedding, each ``[..., N, head_dim]``."""
+"""Cosines and signed sines of a rotary embedding, each ``[..., N, head_dim]``, for :func:`rotate`."""
 
 
-def grid_positions(height: int, width: int, like: Tensor) -> Tensor:
+def grid_positions(height: int, width: int, device: torch.device) -> Tensor:
     """Returns patch positions ``[height * width, 2]`` as (y, x), row major, starting at 0."""
-    y = torch.arange(height, device=like.device, dtype=torch.float32)
-    x = torch.arange(width, device=like.device, dtype=torch.float32)
+    y = torch.arange(height, device=device, dtype=torch.float32)
+    x = torch.arange(width, device=device, dtype=torch.float32)
     return torch.stack((y[:, None].expand(height, width), x[None].expand(height, width)), -1).flatten(0, 1)
 
 
@@ -116,17 +155,17 @@ def rotary_2d(positions: Tensor, head_dim: int, base: float = 100.0) -> Rotary:
         base: base of the wavelengths; channel pair i of each half rotates by ``position * base ** (-4 i / head_dim)``.
 
     Returns:
-        Cosines and sines ``[..., N, head_dim]`` in float32.
+        Tables in float32.
     """
     quarter = head_dim // 4
     exponents = torch.arange(quarter, device=positions.device, dtype=torch.float32) / quarter
     angles = positions[..., None] * base**-exponents  # [..., N, 2, head_dim / 4]
-    angles = torch.cat((angles, angles), -1).flatten(-2)
-    return angles.cos(), angles.sin()
+    cos, sin = angles.cos(), angles.sin()
+    return torch.cat((cos, cos), -1).flatten(-2), torch.cat((-sin, sin), -1).flatten(-2)
 
 
 def rotate(features: Tensor, rotary: Rotary) -> Tensor:
     """Applies :func:`rotary_2d` tables to queries or keys ``[..., N, head_dim]``, in the features' dtype."""
     cos, sin = (table.to(features.dtype) for table in rotary)
     a, b, c, d = features.chunk(4, -1)
-    return features * cos + torch.cat((-b, a, -d, c), -1) * sin
+    return features * cos + torch.cat((b, a, d, c), -1) * sin

@@ -115,7 +115,7 @@ class _Aggregator(nn.Module):
         count, start = x.shape[1], special.shape[1]
 
         # rotary tables
-        positions = grid_positions(*grid, like=x) + 1  # position 0 is for the special tokens
+        positions = grid_positions(*grid, x.device) + 1  # position 0 is for the special tokens
         positions = torch.cat((positions.new_zeros(start, 2), positions))
         frame_rotary = rotary_2d(positions, self.head_dim)
         global_rotary = tuple(table.repeat(views, 1) for table in frame_rotary)
@@ -157,9 +157,9 @@ class VGGTDecoder(nn.Module):
         self.camera_head = _CameraHead(token_dim, camera_depth, camera_heads)
         self.depth_head = DPT(token_dim, features, out_channels, 2, patch_size, rectified_skip=True)
 
-    def decode(self, tokens: Tokens, chunk: int | None) -> Geometry:
+    def decode(self, tokens: Tokens, chunk: int | None, cameras: Cameras | None = None) -> Geometry:
         """See :meth:`Backend.decode`; the depth head runs on at most ``chunk`` views at a time."""
-        return decode_geometry(self.depth_head, tokens, self.decode_cameras(tokens), chunk)
+        return decode_geometry(self.depth_head, tokens, cameras or self.decode_cameras(tokens), chunk)
 
     def decode_cameras(self, tokens: Tokens) -> Cameras:
         """See :meth:`Backend.decode_cameras`."""

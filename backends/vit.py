@@ -30,7 +30,7 @@ class Attention(nn.Module):
         query, key, value = self.qkv(x).unflatten(-1, (3, self.num_heads, -1)).permute(2, 0, 3, 1, 4).unbind(0)
         query, key = self.q_norm(query), self.k_norm(key)
         if rotary is not None:
-            query, key = rotate(query, rotary), rotate(key, rotary)
+            query, key = rotate(torch.stack((query, key)), rotary)
         # Under autocast, normalised queries and keys may stay float32, but the three dtypes must match.
         out = F.scaled_dot_product_attention(query.to(value.dtype), key.to(value.dtype), value)
         return self.proj(out.transpose(1, 2).flatten(2))

@@ -1,4 +1,4 @@
-"""Counts what a step asks of a GPU, on a CPU: operations, and waits of the host for a value from the device.
+"""Counts what a step asks of a GPU, on a CPU: kernels, and waits of the host for a value from the device.
 
 Counts of waits are lower bounds: operations that wait twice internally count once (except ``bincount``), and copies to
 the device are not counted.
@@ -29,6 +29,13 @@ WAITING = {
     "bincount": 2,  # minimum and maximum
 }
 PACKAGE = "vg2gt"
+# What differs from one kernel per operation: nothing runs, or a fill and a copy.
+KERNELS = {
+    **dict.fromkeys(("empty", "empty_like", "empty_strided", "new_empty", "new_empty_strided"), 0),
+    **dict.fromkeys(("_unsafe_view", "promote_types", "_local_scalar_dense"), 0),
+    **dict.fromkeys(("constant_pad_nd", "slice_backward", "select_backward"), 2),
+}
+TENSORS = 30  # that a multi-tensor kernel takes at least
 
 
 class Waits(TorchDispatchMode):
@@ -94,7 +101,11 @@ def place(frame: FrameType | None) -> str:
 
 
 class Operations(TorchDispatchMode):
-    """Counts torch operations inside its block, except views and where ``muted()``, by calling function."""
+    """Counts kernels of torch operations inside its block, except where ``muted()``, by calling function.
+
+    An operation counts as one, but for views and :data:`KERNELS`; those over lists of tensors as one per
+    :data:`TENSORS`. Counts are lower bounds: sorting, for one, takes several.
+    """
 
     def __init__(self, muted: Callable[[], bool] = lambda: False) -> None:
         super().__init__()
@@ -103,7 +114,10 @@ class Operations(TorchDispatchMode):
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         if not func.is_view and not self.muted():
-            self.places[place(sys._getframe(1))] += 1
+            name = func.overloadpacket.__name__
+            several = name.startswith(("_foreach", "_fused"))
+            count = -(-len(args[0]) // TENSORS) if several else KERNELS.get(name, 1)
+            self.places[place(sys._getframe(1))] += count
         return func(*args, **(kwargs or {}))
 
 
@@ -134,7 +148,7 @@ RENDER = Counter({"the renderer's operations and kernels": 33})
 
 
 def count_step(step: Callable[[], Any]) -> tuple[Counter[str], Counter[str]]:
-    """Operations and waits of a training step on a GPU; the renderer counts as ``RENDER`` and one wait."""
+    """Kernels and waits of a training step on a GPU; the renderer counts as ``RENDER`` and one wait."""
     from vg2gt.method import serialization
     from vg2gt.profiling import listening
 

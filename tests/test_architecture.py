@@ -42,7 +42,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     | BASICS,
     "outputs": {"monitor", "inputs", "reconstruction", "visibility", "rendering", "viewer"} | BASICS,
     "api": {"monitor", "inputs", "reconstruction", "outputs", "runs"},
-    "training": {"evaluation", "runs", "model", "losses", "rendering", "data", "backends"} | BASICS,
+    "training": {"evaluation", "runs", "model", "method", "losses", "rendering", "data", "backends"} | BASICS,
     "studies": {"training", "evaluation", "runs"} | BASICS,
     "cli": {
         "api",

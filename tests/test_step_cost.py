@@ -10,19 +10,18 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from tests.gpu_counts import as_on_a_gpu, count_step
 from tests.training_helpers import NARROW
 
-# At fe8e252, counted alike: 20,262 and a render of 8 views in plain torch, which every fresh run took there.
-BEFORE = 20_262 + 10_113
-WAITS = 40
+# Measured: 5,774 and 16; 8,276 and 22 before weights were cast together (da3_large: 6,046 and 16, 8,618 and 22).
+KERNELS, WAITS = 5_900, 16
 
 
-def test_operations_and_waits_of_a_training_step(benchmark_script, tmp_path: Path) -> None:
+def test_kernels_and_waits_of_a_training_step(benchmark_script, tmp_path: Path) -> None:
     common = benchmark_script("common")
     tiny = ("backend=da3_tiny", "backend.pretrained=false", "trainer.precision=bf16-mixed", *NARROW)
     overrides = ("experiment=paper", "data=synthetic", *tiny)
     run, batch = common.prepare(2, (28, 56), overrides, torch.device("cpu"), tmp_path)
-    operations, waits = count_step(partial(common.whole_step(run), batch.context))
+    kernels, waits = count_step(partial(common.whole_step(run), batch.context))
     assert 0 < waits.total() <= WAITS, waits.most_common()
-    assert 5_000 < operations.total() <= 8_500 < BEFORE / 3, operations.most_common(30)
+    assert 5_000 < kernels.total() <= KERNELS, kernels.most_common(30)
 
 
 class FloatProducts(TorchDispatchMode):

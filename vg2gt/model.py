@@ -338,7 +338,7 @@ class VG2GT(Reconstructor):
         with stage("coarse"):
             tokens = self.coarse(tokens, initial, generator=generator)
         with stage("decode_again"):
-            again = masked(self.backend.decode(tokens), hints)
+            again = masked(self.backend.decode_again(tokens, initial.cameras), hints)
         # the camera token is unchanged, so the cameras of the first decoding stay valid
         depth = again.depth * unit[:, None, None, None]
         depth = depth if not self.keep_scale else with_scale_of(initial, depth)

@@ -11,7 +11,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from backends.positions import Rotary, grid_positions, resize_position_embedding, rotary_2d
+from backends.positions import Rotary, grid_positions, remembered, resize_position_embedding, rotary_2d
 from backends.vit import FeedForward, PatchEmbed, ViTBlock, first_and_others
 
 ReferenceView = Literal["first", "saddle_balanced"]
@@ -80,7 +80,7 @@ class Backbone(nn.Module):
         batch, views = images.shape[:2]
         grid = (images.shape[-2] // self.patch_size, images.shape[-1] // self.patch_size)
         x = self._embed(images.flatten(0, 1), grid).unflatten(0, (batch, views))
-        local_rotary, global_rotary = self._rotary(grid, views, x)
+        local_rotary, global_rotary = _rotary_tables(grid, views, self.head_dim, x.device)
         choose = camera_tokens is None and reference != "first"
         order: Tensor | None = None
         local, tapped, camera = x, [], x[:, :, 0]
@@ -113,19 +113,21 @@ class Backbone(nn.Module):
         first = (self.cls_token + self.pos_embed[:, :1]).expand(images.shape[0], -1, -1)
         return torch.cat((first.to(patches.dtype), patches), 1)
 
-    def _rotary(self, grid: tuple[int, int], views: int, like: Tensor) -> tuple[Rotary, Rotary]:
-        """Tables within views (patch positions from 1) and across views (all patches at (1, 1)); class token at 0."""
-        patches = grid_positions(*grid, like=like) + 1
-        special = patches.new_zeros(1, 2)
-        within = rotary_2d(torch.cat((special, patches)), self.head_dim)
-        cos, sin = rotary_2d(torch.cat((special, torch.ones_like(patches))), self.head_dim)
-        return within, (cos.repeat(views, 1), sin.repeat(views, 1))
-
     def _tap(self, local: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
         if self.multiview_from == len(self.blocks):
             return self.norm(x[:, :, 1:]), x[:, :, 0]
         patch = torch.cat((local[:, :, 1:], self.norm(x[:, :, 1:]).to(local.dtype)), -1)
         return patch, torch.cat((local[:, :, 0], x[:, :, 0]), -1)
+
+
+@remembered
+def _rotary_tables(grid: tuple[int, int], views: int, head_dim: int, device: torch.device) -> tuple[Rotary, Rotary]:
+    """Tables within views (patch positions from 1) and across views (all patches at (1, 1)); class token at 0."""
+    patches = grid_positions(*grid, device) + 1
+    special = patches.new_zeros(1, 2)
+    within = rotary_2d(torch.cat((special, patches)), head_dim)
+    cos, sin = rotary_2d(torch.cat((special, torch.ones_like(patches))), head_dim)
+    return within, (cos.repeat(views, 1), sin.repeat(views, 1))
 
 
 def _select_reference(tokens: Tensor) -> Tensor:

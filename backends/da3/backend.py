@@ -83,9 +83,9 @@ class DA3Decoder(nn.Module):
         self.head = DPT(token_dim, features, out_channels, 2, patch_size)
         self.cam_dec = _CameraDecoder(token_dim)
 
-    def decode(self, tokens: Tokens, chunk: int | None) -> Geometry:
+    def decode(self, tokens: Tokens, chunk: int | None, cameras: Cameras | None = None) -> Geometry:
         """See :meth:`Backend.decode`; the depth head runs on at most ``chunk`` views at a time."""
-        return decode_geometry(self.head, tokens, self.decode_cameras(tokens), chunk)
+        return decode_geometry(self.head, tokens, cameras or self.decode_cameras(tokens), chunk)
 
     def decode_cameras(self, tokens: Tokens) -> Cameras:
         """See :meth:`Backend.decode_cameras`."""

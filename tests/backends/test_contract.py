@@ -73,6 +73,14 @@ def test_cameras_alone_are_those_of_all(backend: Backend, scene, tokens: Tokens,
         assert cameras.size == geometry.cameras.size
 
 
+def test_decoding_again_with_known_cameras_gives_the_same_geometry(
+    backend: Backend, tokens: Tokens, geometry: Geometry
+) -> None:
+    again = backend.decode_again(tokens, geometry.cameras)
+    for name in ("depth", "depth_conf", "scale"):
+        assert torch.equal(getattr(again, name), getattr(geometry, name))
+
+
 def test_given_poses_keep_their_direction(backend: Backend, scene, geometry: Geometry) -> None:
     """World to camera: the inverse of what is given is not nearer than what is given."""
     if not backend.needs_hints:

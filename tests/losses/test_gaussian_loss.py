@@ -4,9 +4,11 @@ from dataclasses import replace
 
 import pytest
 import torch
+from kornia.metrics import ssim
 from torch import Tensor
 
 from vg2gt.geometry.normals import normals_from_depth
+from vg2gt.kernels.structure import WINDOW
 from vg2gt.losses import GaussianLoss, VG2GTLoss
 from vg2gt.losses.gaussian import RenderTargets, structure_loss, structure_reference
 from vg2gt.types import Cameras, Render
@@ -163,5 +165,7 @@ def test_the_compiled_loss_equals_the_plain_one(size: tuple[int, int]) -> None:
     loss, expected = structure_loss(found, reference), structure_reference(exact, reference.double())
     assert type(loss.grad_fn).__name__ == "StructureBackward"
     torch.testing.assert_close(loss.double(), expected, rtol=1e-6, atol=1e-7)
+    kornias = (1 - ssim(exact, reference.double(), WINDOW)).mean()  # adds 1e-12 to a denominator of at least 9e-8
+    torch.testing.assert_close(expected, kornias, rtol=0, atol=2e-5)
     gradients = [torch.autograd.grad(3 * value, x)[0] for value, x in ((loss, found), (expected, exact))]
     assert (gradients[0] - gradients[1]).abs().max() < 1e-5 * gradients[1].abs().max()

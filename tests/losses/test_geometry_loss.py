@@ -1,12 +1,13 @@
 """VGGT's terms against straightforward re-derivations on point maps."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 
 import pytest
 import torch
 from torch import Tensor
 
-from tests.gpu_counts import Waits
+from tests.gpu_counts import Waits, as_on_a_gpu
 from vg2gt.geometry.cameras import scale_translations, unproject
 from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.losses import GeometryLoss
@@ -22,9 +23,9 @@ from vg2gt.losses.truth import normalize_truth
 from vg2gt.types import Cameras
 
 
-def disturbed(sample, size=(24, 32), seed=3):
+def disturbed(sample, size=(24, 32), seed=3, scenes=1):
     """A sample's truth, and predicted depth, confidence and cameras that differ from it, in the truth's unit."""
-    made = sample(size=size)
+    made = sample(size=size, scenes=scenes)
     generator = torch.Generator().manual_seed(seed)
     truth = normalize_truth(made.batch).views(slice(0, 3))
     noise = torch.randn(truth.depth.shape, generator=generator, dtype=torch.float64)
@@ -77,12 +78,37 @@ def test_tasks_match_their_definitions_on_depth_and_point_maps(sample) -> None:
     task, of_points = GeometryLoss()(depth, conf, cameras, truth, valid)
     error = depth[0] - truth.depth[0]
     expected = *slow_mean_terms(error.abs(), conf[0], valid[0]), slow_depth_gradient(error, valid[0])
-    torch.testing.assert_close((task.conf, task.reg, task.grad), expected)
-    torch.testing.assert_close(task.total, sum(expected))
+    torch.testing.assert_close((task[0].conf, task[0].reg, task[0].grad), expected)
+    torch.testing.assert_close(task[0].total, sum(expected))
     points, true_points = unproject(depth, cameras)[0], unproject(truth.depth, truth.cameras)[0]
     error = (points - true_points).norm(dim=-1)
     expected = *slow_mean_terms(error, conf[0], valid[0]), slow_point_normals(points, true_points, valid[0])
-    torch.testing.assert_close((of_points.conf, of_points.reg, of_points.grad), expected)
+    torch.testing.assert_close((of_points[0].conf, of_points[0].reg, of_points[0].grad), expected)
+
+
+@pytest.mark.parametrize("on_gpu", [False, True])
+def test_scenes_and_predictions_together_equal_each_alone(sample, on_gpu: bool) -> None:
+    """In value and gradient; scenes have different numbers of valid pixels."""
+    truth, depth, conf, cameras, valid = disturbed(sample, size=(26, 40), scenes=2)
+    valid[1, :, 9:] = False
+    both = cameras.map(lambda tensor: torch.stack((tensor, tensor)))
+    maps = torch.stack((depth, depth * 1.1)), torch.stack((conf, conf + 1))
+    together, alone = ([values.clone().requires_grad_() for values in maps] for _ in range(2))
+    with as_on_a_gpu() if on_gpu else nullcontext():
+        found = GeometryLoss()(*together, both, truth, valid)
+        each = [
+            [GeometryLoss()(*(x[p, b : b + 1] for x in alone), cameras.scene(b), truth.map(lambda t, b=b: t[b : b + 1]),
+                            valid[b : b + 1]) for b in range(2)]
+            for p in range(2)
+        ]  # fmt: skip
+    for task in range(2):
+        for part in ("conf", "reg", "grad"):
+            values = torch.stack([torch.cat([getattr(scene[task], part) for scene in one]) for one in each])
+            torch.testing.assert_close(getattr(found[task], part), values, rtol=1e-12, atol=1e-14)
+    (found[0].total.sum() + found[1].total.sum()).backward()
+    torch.cat([task.total for one in each for scene in one for task in scene]).sum().backward()
+    for one, other in zip(together, alone, strict=True):
+        torch.testing.assert_close(one.grad, other.grad, rtol=1e-9, atol=1e-14)
 
 
 def test_one_set_of_pixels_is_kept_below_the_quantile() -> None:
@@ -119,7 +145,7 @@ def test_an_outlier_has_no_gradient_and_errors_stop_at_100(sample) -> None:
     assert depth.grad[0, 1, 5, 6] != 0
     assert float(depth_gradient_loss(depth[0].detach() - truth.depth[0], everywhere[0])) < 2
     far, _ = GeometryLoss(quantile=1.0)(truth.depth + 500, torch.ones_like(conf), cameras, truth, everywhere)
-    torch.testing.assert_close(torch.stack((far.reg, far.conf)), torch.full((2,), 100.0, dtype=torch.float64))
+    torch.testing.assert_close(torch.cat((far.reg, far.conf)), torch.full((2,), 100.0, dtype=torch.float64))
 
 
 def test_holes_and_infinities_outside_the_mask_leave_gradients_finite(sample) -> None:
@@ -186,9 +212,9 @@ def test_compiled_normals_equal_the_plain_ones(sample, dtype: torch.dtype, toler
         return tensor.to(dtype) if tensor.is_floating_point() else tensor
 
     truth, cameras = truth.map(cast), cameras.map(cast)
-    found, expected = (depth[0].to(dtype).requires_grad_() for _ in range(2))
-    compiled = point_normal_loss(found, cameras, truth, valid[0])
-    plain = point_normal_reference(expected, cameras, truth, valid[0])
+    found, expected = (depth.to(dtype, copy=True).requires_grad_() for _ in range(2))
+    compiled = point_normal_loss(found, cameras, truth, valid)
+    plain = point_normal_reference(expected, cameras, truth, valid)
     assert type(compiled.grad_fn) is not type(plain.grad_fn)
     torch.testing.assert_close(compiled, plain, rtol=tolerance, atol=tolerance / 10)
     (3 * compiled).backward()
@@ -199,6 +225,6 @@ def test_compiled_normals_equal_the_plain_ones(sample, dtype: torch.dtype, toler
 def test_normals_give_cameras_a_gradient_where_they_ask_for_one(sample) -> None:
     truth, depth, _, cameras, valid = disturbed(sample)
     poses = cameras.world_to_camera.clone().requires_grad_()
-    loss = point_normal_loss(depth[0], replace(cameras, world_to_camera=poses), truth, valid[0])
+    loss = point_normal_loss(depth, replace(cameras, world_to_camera=poses), truth, valid)
     (gradient,) = torch.autograd.grad(loss, poses)
     assert gradient.any()

@@ -95,7 +95,7 @@ def test_gradients_flow_to_features_and_positions():
 def test_the_cost_of_the_search_by_cells_is_linear(search, monkeypatch):
     """Counted: distances computed per query, for a scene and for one sixteen times as large and as dense."""
     examined, nearest = [], knn._nearest
-    monkeypatch.setattr(knn, "_nearest", lambda *args: (examined.append(args[4]), nearest(*args)))
+    monkeypatch.setattr(knn, "_nearest", lambda *args: (examined.append(args[6]), nearest(*args)))
     per_query = []
     for copies in (1, 16):
         places = torch.arange(copies)[:, None, None] * torch.tensor([500.0, 0, 0])

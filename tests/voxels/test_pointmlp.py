@@ -54,7 +54,7 @@ def test_a_stage_is_what_the_paper_says(counts):
     features = (3 + torch.randn(len(batch), 6, dtype=torch.float64)).requires_grad_()
     positions = torch.randint(0, 1000, (len(batch), 3)).double()
     order = torch.arange(len(batch))
-    windows = make_windows(order, counts, 8, shift=4)
+    windows = make_windows(counts, 8, order.device, shift=4).along(order)
     outputs = [stage(features, positions, windows), stage_as_written(stage, features, positions, windows, batch)]
     torch.testing.assert_close(*outputs)
     inputs = [features, *stage.parameters()]

@@ -31,7 +31,7 @@ def test_dropping_three_bits_gives_the_parent_and_z_order_interleaves_bits():
     assert torch.equal(z_codes(cells) >> 3, z_codes(cells >> 1))
     assert torch.equal(hilbert_codes(cells, 4) >> 3, hilbert_codes(cells >> 1, 3))
     for order in ORDERS:
-        codes = serial_codes(cells, 4, order) >> 3
+        codes = serial_codes(cells, 4, [order])[0] >> 3
         parents = (cells >> 1) @ torch.tensor([64, 8, 1])
         assert torch.stack((codes, parents), 1).unique(dim=0).shape[0] == 8**3
     cells = torch.tensor([[1, 0, 0], [0, 1, 0], [0, 0, 1], [2, 0, 0], [(1 << 21) - 1, 0, 0]])
@@ -55,7 +55,7 @@ def test_every_voxel_is_owned_once_by_a_window_of_its_scene(count, shift):
     counts = [count, 11, 0, 3]
     batch = torch.arange(4).repeat_interleave(torch.tensor(counts))
     order = torch.cat([torch.randperm(n) + sum(counts[:i]) for i, n in enumerate(counts)])
-    windows = make_windows(order, counts, 8, shift)
+    windows = make_windows(counts, 8, order.device, shift).along(order)
     rows = torch.cat([group.rows.flatten() for group in windows.groups])
     assert torch.equal(rows[windows.owner], torch.arange(len(order)))
     position = order.argsort()

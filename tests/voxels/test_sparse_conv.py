@@ -52,6 +52,18 @@ def test_pairs_are_the_same_however_many_offsets_are_looked_up_at_once(random_vo
         assert all(torch.equal(a, b) for a, b in zip(ours, theirs, strict=True))
 
 
+def test_sets_of_cells_searched_together_have_the_tables_of_each_alone(random_voxels):
+    sets = []
+    for counts, extent, size in (((60, 40), 7, 3), ((9, 0), 3, 3), ((60, 40), 7, 5)):
+        grid, batch = random_voxels(counts, extent=extent)
+        low = torch.stack([grid[batch == b].amin(0) if (batch == b).any() else grid[0] for b in range(2)])
+        sets.append(Cells(grid - low[batch], batch, size, (2 * extent + 1, 2 * extent + 1, 2 * extent + 1, 2)))
+    for found, cells in zip(neighbor_tables(sets), sets, strict=True):
+        alone = neighbor_table(cells.grid, cells.batch, cells.kernel_size)
+        for one, other in zip(vars(found).values(), vars(alone).values(), strict=True):
+            assert torch.equal(one, other)
+
+
 def test_bfloat16_products_are_summed_in_float32(find, random_voxels):
     """Within the rounding of the factors; sums of 27 numbers of bfloat16 would be off by more."""
     grid, batch = random_voxels((150, 100), extent=7)

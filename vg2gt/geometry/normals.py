@@ -27,6 +27,11 @@ def ray_slopes(intrinsics: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tenso
     return (x - cx) / fx, (y - cy) / fy
 
 
+def _neighbours(maps: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Returns the left, right, upper and lower neighbours ``[..., H - 2, W - 2]`` of the inner pixels."""
+    return maps[..., 1:-1, :-2], maps[..., 1:-1, 2:], maps[..., :-2, 1:-1], maps[..., 2:, 1:-1]
+
+
 def normals_from_depth(depth: Tensor, intrinsics: Tensor, edge_threshold: float = 0.05) -> tuple[Tensor, Tensor]:
     """Returns camera-frame normals from central differences of unprojected points.
 
@@ -43,13 +48,10 @@ def normals_from_depth(depth: Tensor, intrinsics: Tensor, edge_threshold: float 
     present = depth > 0
     filled = torch.where(present, depth, 1.0)
     center = filled[..., 1:-1, 1:-1]
-    left, right = filled[..., 1:-1, :-2], filled[..., 1:-1, 2:]
-    up, down = filled[..., :-2, 1:-1], filled[..., 2:, 1:-1]
-
-    valid = present[..., 1:-1, 1:-1]
-    neighbours = (present[..., 1:-1, :-2], present[..., 1:-1, 2:], present[..., :-2, 1:-1], present[..., 2:, 1:-1])
-    for neighbour, neighbour_depth in zip(neighbours, (left, right, up, down), strict=True):
-        valid = valid & neighbour & ((neighbour_depth - center).abs() <= edge_threshold * center)
+    left, right, up, down = _neighbours(filled)
+    limit = (edge_threshold * center).detach()
+    smooth = (torch.stack((left, right, up, down)).detach() - center.detach()).abs() <= limit
+    valid = torch.stack((present[..., 1:-1, 1:-1], *_neighbours(present))).all(0) & smooth.all(0)
 
     u, v = ray_slopes(intrinsics, (depth.shape[-2], depth.shape[-1]))
     gx = intrinsics[..., 0, 0, None, None] * (right - left) / (right + left)

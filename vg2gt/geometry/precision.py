@@ -9,7 +9,11 @@ from __future__ import annotations
 from contextlib import AbstractContextManager, nullcontext
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+
+
+class Float32Linear(nn.Linear):
+    """A linear layer whose weights its owner reads: they stay float32 (:mod:`vg2gt.training.casts`)."""
 
 
 def half_precision_on_gpu(like: Tensor) -> torch.autocast:

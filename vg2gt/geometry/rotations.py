@@ -9,13 +9,15 @@ from torch.nn import functional as F
 
 def quat_to_matrix(quats: Tensor) -> Tensor:
     """Returns rotation matrices ``[..., 3, 3]`` of quaternions ``[..., 4]`` (wxyz), which are normalised first."""
-    w, x, y, z = F.normalize(quats, dim=-1).unbind(-1)
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    unit = F.normalize(quats, dim=-1)
+    # all products at once; twice them, which is exact
+    w, x, y, z = (row.unbind(-1) for row in (2 * (unit[..., :, None] * unit[..., None, :])).unbind(-2))
+    elements = (
+        *(1 - (y[2] + z[3]), x[2] - w[3], x[3] + w[2]),
+        *(x[2] + w[3], 1 - (x[1] + z[3]), y[3] - w[1]),
+        *(x[3] - w[2], y[3] + w[1], 1 - (x[1] + y[2])),
     )
-    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+    return torch.stack(elements, -1).unflatten(-1, (3, 3))
 
 
 def matrix_to_quat(matrix: Tensor) -> Tensor:

@@ -16,7 +16,7 @@ from vg2gt.kernels.threads import compilable, parallel_for
 
 QUERIES_AT_ONCE = 256  # per thread, for k-d trees
 BITS = 19  # bits per axis of the finest cells, fewer if the key must hold many scenes
-QUERIES = 1 << 18  # queries per chunk
+QUERIES = 1 << 17  # queries per chunk
 CANDIDATES = 1 << 23  # distances held at once, about 60 bytes each
 SHIFT = 0.37  # offset of the second curve, in extents: the two curves rarely jump at the same place
 SLACK = 1e-9  # relative margin for the rounding of distances
@@ -95,30 +95,34 @@ def interpolate(features: Tensor, index: Tensor, weights: Tensor) -> Tensor:
     return F.embedding_bag(index, features, mode="sum", per_sample_weights=weights)
 
 
-class _Curve:
-    """Points sorted along a Morton curve through all scenes.
+class _Curves:
+    """Points sorted along two Morton curves through all scenes, the second with positions shifted.
 
     Attributes:
         bits: bits per axis of a cell.
-        shift: offset added to positions before they are encoded.
-        keys: ``[M]`` sorted ``scene << 3 bits | code``.
-        order: ``[M]`` original row of each sorted point.
-        points: ``[M, 3]`` float64 sorted points, in extents.
+        keys: ``[2, M]`` sorted ``scene << 3 bits | code``.
+        order: ``[2, M]`` original row of each sorted point.
+        points: ``[2, M, 3]`` float64 sorted points, in extents.
     """
 
-    def __init__(self, points: Tensor, batch: Tensor, shift: float, bits: int) -> None:
-        self.bits, self.shift = bits, shift
-        self.keys, self.order = torch.sort(self.key(self.cells(points), batch), stable=True)
+    def __init__(self, points: Tensor, batch: Tensor, bits: int) -> None:
+        self.bits = bits
+        self.keys, self.order = torch.sort(self.key(self.cells(_shifted(points)), batch), stable=True)
         self.points = points[self.order]
 
     def cells(self, positions: Tensor) -> Tensor:
-        """Returns the finest cells ``[N, 3]`` of positions in extents, clamped to the grid; monotone on every axis."""
-        cells = ((positions + self.shift) / (1 + SHIFT) * (1 << self.bits)).floor()
+        """Returns the finest cells ``[..., 3]`` of positions in extents, clamped to the grid; monotone on each axis."""
+        cells = (positions / (1 + SHIFT) * (1 << self.bits)).floor()
         return cells.clamp(0, (1 << self.bits) - 1).long()
 
     def key(self, cells: Tensor, batch: Tensor) -> Tensor:
         """Returns the curve keys of cells ``[..., 3]`` of scenes ``[...]``."""
         return batch << 3 * self.bits | z_codes(cells)
+
+
+def _shifted(positions: Tensor) -> Tensor:
+    """Returns positions ``[N, 3]`` as they are and shifted: ``[2, N, 3]``."""
+    return torch.stack((positions, positions + SHIFT))
 
 
 def nearest_by_cells(
@@ -135,60 +139,62 @@ def nearest_by_cells(
     extent = (points.amax(0).double() - low).amax().clamp(min=torch.finfo(torch.float32).tiny)
     points, queries = (points.double() - low) / extent, (queries.double() - low) / extent
     bits = min(BITS, (62 - scenes.bit_length()) // 3)
-    curves = [_Curve(points, point_batch, shift, bits) for shift in (0.0, SHIFT)]
+    curves = _Curves(points, point_batch, bits)
     first = torch.searchsorted(point_batch, torch.arange(scenes + 1, device=points.device))
     index = queries.new_zeros(len(queries), neighbors, dtype=torch.int64)
     found = torch.zeros_like(index, dtype=torch.bool)
     for begin in range(0, len(queries), QUERIES):
         part = slice(begin, begin + QUERIES)
         batch = query_batch[part]
-        radius = torch.stack([_bound(queries[part], batch, curve, first, neighbors) for curve in curves]).amin(0)
-        _search(queries[part], batch, radius, curves[0], index[part], found[part])
+        radius = _bound(queries[part], batch, curves, first, neighbors)
+        _search(queries[part], batch, radius, curves, index[part], found[part])
     return index, found
 
 
-def _bound(queries: Tensor, batch: Tensor, curve: _Curve, first: Tensor, neighbors: int) -> Tensor:
-    """Bounds the k-th distance ``[N]`` by that among the 2 k points next to each query on a curve, or by infinity."""
-    width = min(2 * neighbors, len(curve.keys))
-    place = torch.searchsorted(curve.keys, curve.key(curve.cells(queries), batch)) - width // 2
-    begin, end = first[batch], first[batch + 1]  # a scene's points are contiguous on the curve
-    place = torch.minimum(torch.maximum(place, begin), torch.maximum(end - width, begin))
-    rows = place[:, None] + torch.arange(width, device=place.device)  # [N, 2 k]
-    squared = (queries[:, None] - curve.points[rows.clamp(max=len(curve.keys) - 1)]).square().sum(-1)
-    squared = torch.where(rows < end[:, None], squared, torch.inf)
+def _bound(queries: Tensor, batch: Tensor, curves: _Curves, first: Tensor, neighbors: int) -> Tensor:
+    """Bounds the k-th distance ``[N]`` by those among the 2 k points next to each query on a curve, or by infinity."""
+    count = curves.keys.shape[1]
+    width = min(2 * neighbors, count)
     if width < neighbors:
-        return torch.full_like(squared[:, 0], torch.inf)
-    return squared.kthvalue(neighbors, 1).values.sqrt()
+        return torch.full_like(queries[:, 0], torch.inf)
+    place = torch.searchsorted(curves.keys, curves.key(curves.cells(_shifted(queries)), batch)) - width // 2
+    begin, end = first[batch], first[batch + 1]  # a scene's points are contiguous on a curve
+    place = torch.minimum(torch.maximum(place, begin), torch.maximum(end - width, begin))
+    rows = place[..., None] + torch.arange(width, device=place.device)  # [2, N, 2 k]
+    which = torch.arange(2, device=place.device)[:, None, None]
+    near = curves.points[which, rows.clamp(max=count - 1)]
+    squared = torch.where(rows < end[:, None], (queries[:, None] - near).square().sum(-1), torch.inf)
+    return squared.kthvalue(neighbors).values.amin(0).sqrt()
 
 
-def _search(queries: Tensor, batch: Tensor, radius: Tensor, curve: _Curve, index: Tensor, found: Tensor) -> None:
+def _search(queries: Tensor, batch: Tensor, radius: Tensor, curves: _Curves, index: Tensor, found: Tensor) -> None:
     """Writes the nearest points within the radius of each query into ``index`` and ``found``."""
-    starts, counts = _ranges(queries, batch, radius * (1 + SLACK) + SLACK / (1 << curve.bits), curve)
+    starts, counts = _ranges(queries, batch, radius * (1 + SLACK) + SLACK / (1 << curves.bits), curves)
     ends = counts.sum(1).cumsum(0)  # [N]
     total = int(ends[-1]) if len(ends) else 0
-    cuts = torch.arange(1, -(-total // CANDIDATES), device=ends.device) * CANDIDATES
-    last = torch.searchsorted(ends, cuts) + 1  # [parts - 1]: number of queries up to and including each cut
-    taken = ends[last - 1]
-    bounds = [(0, 0), *torch.stack((last, taken), -1).tolist(), (len(queries), total)]
+    bounds = [(0, 0), (len(queries), total)]
+    if total > CANDIDATES:
+        cuts = torch.arange(1, -(-total // CANDIDATES), device=ends.device) * CANDIDATES
+        last = torch.searchsorted(ends, cuts) + 1  # [parts - 1]: number of queries up to and including each cut
+        bounds[1:1] = torch.stack((last, ends[last - 1]), -1).tolist()
     for (begin, before), (end, after) in itertools.pairwise(bounds):
-        part = slice(begin, end)
         if begin < end:
-            _nearest(
-                queries[part], radius[part], starts[part], counts[part], after - before, curve, index[part], found[part]
-            )
+            part = slice(begin, end)
+            inputs = (queries[part], radius[part], starts[part], counts[part], index[part], found[part])
+            _nearest(*inputs, after - before, curves)
 
 
-def _ranges(queries: Tensor, batch: Tensor, radius: Tensor, curve: _Curve) -> tuple[Tensor, Tensor]:
+def _ranges(queries: Tensor, batch: Tensor, radius: Tensor, curves: _Curves) -> tuple[Tensor, Tensor]:
     """Returns the start on the curve and the number of points of each cell that a ball meets, ``[N, 27]`` each."""
-    low, high = curve.cells(queries - radius[:, None]), curve.cells(queries + radius[:, None])
+    low, high = curves.cells(queries - radius[:, None]), curves.cells(queries + radius[:, None])
     # the finest level at which three cells per axis cover the ball
     level = (torch.frexp((high - low).amax(-1).double())[1].long() - 1).clamp(min=0)[:, None]  # [N, 1]
     low, high = low >> level, high >> level
     steps = torch.cartesian_prod(*[torch.arange(3, device=low.device)] * 3)  # [27, 3]
     cells = low[:, None] + steps  # [N, 27, 3]
-    key = curve.key(cells << level[..., None], batch[:, None])
-    starts = torch.searchsorted(curve.keys, key)
-    counts = torch.searchsorted(curve.keys, key + (1 << 3 * level)) - starts
+    key = curves.key(cells << level[..., None], batch[:, None])
+    starts = torch.searchsorted(curves.keys[0], key)
+    counts = torch.searchsorted(curves.keys[0], key + (1 << 3 * level)) - starts
     return starts, torch.where((cells <= high[:, None]).all(-1), counts, 0)
 
 
@@ -197,17 +203,17 @@ def _nearest(
     radius: Tensor,
     starts: Tensor,
     counts: Tensor,
-    total: int,
-    curve: _Curve,
     index: Tensor,
     found: Tensor,
+    total: int,
+    curves: _Curves,
 ) -> None:
     """Writes the nearest points in the ranges ``[N, 27]`` of each query; the ranges hold ``total`` points in all."""
     sizes = counts.flatten()
     owner = torch.arange(len(sizes), device=sizes.device).repeat_interleave(sizes, output_size=total)  # [total]
     place = torch.arange(total, device=sizes.device) + (starts.flatten() - sizes.cumsum(0) + sizes)[owner]
     query = owner // starts.shape[1]
-    squared = (queries[query] - curve.points[place]).square().sum(-1)
+    squared = (queries[query] - curves.points[0][place]).square().sum(-1)
     inside = (squared <= (radius * (1 + SLACK)).square()[query]).nonzero()[:, 0]
     query, place, squared = query[inside], place[inside], squared[inside]
     order = torch.argsort(squared, stable=True)
@@ -216,7 +222,7 @@ def _nearest(
     rank = torch.arange(len(query), device=query.device) - torch.searchsorted(query, query)
     # points beyond the k-th go to an extra column that is dropped: filtering them would need their number
     column = rank.clamp(max=index.shape[1])
-    rows = query.new_zeros(len(queries), index.shape[1] + 1).index_put_((query, column), curve.order[place])
+    rows = query.new_zeros(len(queries), index.shape[1] + 1).index_put_((query, column), curves.order[0][place])
     there = torch.zeros_like(rows, dtype=torch.bool).index_put_((query, column), torch.ones_like(query).bool())
     index.copy_(rows[:, :-1])
     found.copy_(there[:, :-1])

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -21,25 +22,30 @@ MAX_ERROR = 100.0
 SMALLEST_SQUARE = 1e-20  # keeps the square root's derivative finite
 QUANTILE_PIXELS = 1000
 DEPTH_STRIDES, POINT_STRIDES = (1, 2, 4, 8), (1, 2, 4)
+MAPS = (-3, -2, -1)  # views, rows and columns
 
 
 @dataclass(frozen=True)
 class TaskLoss:
-    """One task's confidence-weighted error, plain error and error of neighbour differences: scalars with gradient."""
+    """One task's confidence-weighted error, plain error and error of neighbour differences: ``[..., B]``."""
 
     conf: Tensor
     reg: Tensor
     grad: Tensor
 
-    @property
+    @cached_property
     def total(self) -> Tensor:
         """``conf + reg + grad``."""
         return self.conf + self.reg + self.grad
 
+    def __getitem__(self, index: int) -> TaskLoss:
+        """Returns the losses at an index of the first axis."""
+        return TaskLoss(self.conf[index], self.reg[index], self.grad[index])
+
 
 @dataclass(frozen=True)
 class GeometryLoss:
-    """Depth and point-map losses of one scene.
+    """Depth and point-map losses of every scene.
 
     For the error ``l = |y_hat - y|`` (not squared) and confidence c: ``conf = mean_q(gamma c l - alpha log c)`` and
     ``reg = mean_q(l)``, with values clamped to 100. Both are over the pixels whose l is at or below its ``quantile``.
@@ -71,144 +77,165 @@ class GeometryLoss:
     def __call__(
         self, depth: Tensor, depth_conf: Tensor, cameras: Cameras, truth: Truth, valid: Tensor
     ) -> tuple[TaskLoss, TaskLoss]:
-        """Returns the losses of the depth task and the point-map task for one scene.
+        """Returns the losses of the depth task and the point-map task of every scene.
+
+        Axes before that of the scenes hold several predictions of the same truth.
 
         Args:
-            depth: ``[1, V, H, W]`` predicted depth in the truth's unit.
-            depth_conf: ``[1, V, H, W]`` its confidence > 0.
-            cameras: predicted cameras in the frame of view 0, translations in the truth's unit.
-            truth: ground truth of the same scene and views.
-            valid: ``[1, V, H, W]`` bool, the pixels to compare.
+            depth: ``[..., B, V, H, W]`` predicted depth in the truth's unit.
+            depth_conf: ``[..., B, V, H, W]`` its confidence > 0.
+            cameras: predicted cameras ``[..., B, V]`` in the frame of view 0, translations in the truth's unit.
+            truth: ground truth of the same scenes and views.
+            valid: ``[B, V, H, W]`` bool, the pixels to compare.
         """
         valid = valid & truth.known[:, None, None, None]
         # replace the prediction by the truth at invalid pixels, so that no infinity or hole reaches the gradients
-        depth = torch.where(valid, depth, truth.depth)[0]
-        conf = torch.where(valid, depth_conf, 1.0)[0]
-        reference, mask = truth.depth[0], valid[0]
-        error = depth - reference
-        depth_task = TaskLoss(*self._value_terms(error.abs(), conf, mask), depth_gradient_loss(error, mask))
-        point_task = TaskLoss(
-            *self._value_terms(point_errors(depth, cameras, truth), conf, mask),
-            point_normal_loss(depth, cameras, truth, mask),
+        depth = torch.where(valid, depth, truth.depth)
+        error = depth - truth.depth
+        errors = torch.stack((error.abs(), point_errors(depth, cameras, truth)))  # of both tasks
+        conf, reg = self._value_terms(errors, torch.where(valid, depth_conf, 1.0), valid)
+        return (
+            TaskLoss(conf[0], reg[0], depth_gradient_loss(error, valid)),
+            TaskLoss(conf[1], reg[1], point_normal_loss(depth, cameras, truth, valid)),
         )
-        return depth_task, point_task
 
     def _value_terms(self, error: Tensor, conf: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
         keep = trusted_pixels(error, valid, self.quantile)
-        count = keep.sum().clamp(min=1)
+        count = keep.sum(MAPS).clamp(min=1)
         weighted = (self.gamma * conf * error - self.alpha * conf.log()).clamp(max=MAX_ERROR)
-        return (weighted * keep).sum() / count, (error.clamp(max=MAX_ERROR) * keep).sum() / count
+        return (weighted * keep).sum(MAPS) / count, (error.clamp(max=MAX_ERROR) * keep).sum(MAPS) / count
 
 
 def trusted_pixels(error: Tensor, valid: Tensor, quantile: float) -> Tensor:
-    """Marks valid pixels whose error, clamped to 100, is at or below its quantile; all if there are at most 1000."""
+    """Marks each scene's pixels whose error, clamped to 100, is at or below its quantile; all if at most 1000.
+
+    Args:
+        error: ``[..., V, H, W]``.
+        valid: ``[V, H, W]`` bool with any of the leading axes; other pixels are never marked.
+        quantile: share of the pixels.
+    """
     clamped = error.detach().clamp(max=MAX_ERROR)
-    candidates = torch.where(valid, clamped, torch.inf).flatten()
-    count = valid.sum()
+    candidates = torch.where(valid, clamped, torch.inf).flatten(-3)
+    count = valid.sum(MAPS)
     statistic = order_statistic if error.device.type == "cpu" else sorted_order_statistic
-    return valid & ((clamped <= statistic(candidates, count, quantile)) | (count <= QUANTILE_PIXELS))
+    limit = statistic(candidates, count.expand(error.shape[:-3]), quantile)
+    return valid & ((clamped <= limit[..., None, None, None]) | (count <= QUANTILE_PIXELS)[..., None, None, None])
 
 
 def order_statistic(values: Tensor, count: Tensor, quantile: float) -> Tensor:
-    """Returns the quantile of the ``count`` smallest of ``values [N]``, without interpolation, for any N."""
-    return values.kthvalue(math.floor(quantile * max(int(count) - 1, 0)) + 1).values
+    """Returns the quantile of the ``count [...]`` smallest of ``values [..., N]``, without interpolation, for any N."""
+    rows = zip(values.flatten(0, -2) if values.dim() > 1 else values[None], count.flatten().tolist(), strict=True)
+    found = [row.kthvalue(math.floor(quantile * max(number - 1, 0)) + 1).values for row, number in rows]
+    return torch.stack(found).view(count.shape)
 
 
 def sorted_order_statistic(values: Tensor, count: Tensor, quantile: float) -> Tensor:
     """:func:`order_statistic` for GPUs, where sorting is many times faster than ``kthvalue``; never synchronises."""
     rank = (quantile * (count - 1).clamp(min=0).double()).floor().long()
-    return values.sort().values.gather(0, rank[None])[0]
+    return values.sort().values.gather(-1, rank[..., None])[..., 0]
 
 
 def depth_gradient_loss(error: Tensor, valid: Tensor) -> Tensor:
-    """Sums differences of the depth error ``[V, H, W]`` between valid neighbours per valid pixel; averages strides."""
+    """Sums differences of the depth error between valid neighbours per valid pixel; averages strides.
+
+    Args:
+        error: ``[..., V, H, W]``.
+        valid: ``[V, H, W]`` bool with any of the leading axes.
+    """
     total = error.new_zeros(())
     for stride in DEPTH_STRIDES:
-        e, m = error[:, ::stride, ::stride], valid[:, ::stride, ::stride]
-        across = (e[..., 1:] - e[..., :-1]).abs().clamp(max=MAX_ERROR) * (m[..., 1:] & m[..., :-1])
-        down = (e[:, 1:] - e[:, :-1]).abs().clamp(max=MAX_ERROR) * (m[:, 1:] & m[:, :-1])
-        total = total + (across.sum() + down.sum()) / m.sum().clamp(min=1)
+        e, m = error[..., ::stride, ::stride], valid[..., ::stride, ::stride]
+        across = e.diff(dim=-1).abs().clamp(max=MAX_ERROR) * (m[..., 1:] & m[..., :-1])
+        down = e.diff(dim=-2).abs().clamp(max=MAX_ERROR) * (m[..., 1:, :] & m[..., :-1, :])
+        total = total + (across.sum(MAPS) + down.sum(MAPS)) / m.sum(MAPS).clamp(min=1)
     return total / len(DEPTH_STRIDES)
 
 
 def point_errors(depth: Tensor, cameras: Cameras, truth: Truth) -> Tensor:
-    """Returns the distance ``[V, H, W]`` between predicted and true points, in each predicted camera's frame.
+    """Returns the distance ``[..., B, V, H, W]`` between predicted and true points, in each predicted camera's frame.
 
     Args:
-        depth: ``[V, H, W]`` predicted depth, in the truth's unit.
-        cameras: predicted cameras (B = 1), translations in the truth's unit.
-        truth: ground truth of one scene.
+        depth: ``[..., B, V, H, W]`` predicted depth, in the truth's unit.
+        cameras: predicted cameras ``[..., B, V]``, translations in the truth's unit.
+        truth: ground truth of the B scenes.
     """
     size = (depth.shape[-2], depth.shape[-1])
-    to_predicted = (cameras.world_to_camera @ invert_rigid(truth.cameras.world_to_camera))[0]
-    u, v = ray_slopes(truth.cameras.intrinsics[0], size)
-    local = torch.stack((truth.depth[0] * u, truth.depth[0] * v, truth.depth[0]), 1).flatten(2)
-    true_points = (to_predicted[:, :3, :3] @ local + to_predicted[:, :3, 3:]).unflatten(-1, size)
-    u, v = ray_slopes(cameras.intrinsics[0], size)
-    x, y, z = true_points.unbind(1)
+    to_predicted = cameras.world_to_camera @ invert_rigid(truth.cameras.world_to_camera)
+    u, v = ray_slopes(truth.cameras.intrinsics, size)
+    local = torch.stack((truth.depth * u, truth.depth * v, truth.depth), -3).flatten(-2)
+    true_points = (to_predicted[..., :3, :3] @ local + to_predicted[..., :3, 3:]).unflatten(-1, size)
+    u, v = ray_slopes(cameras.intrinsics, size)
+    x, y, z = true_points.unbind(-3)
     squared = (depth * u - x).square() + (depth * v - y).square() + (depth - z).square()
     return squared.clamp(min=SMALLEST_SQUARE).sqrt()
 
 
 def point_normal_loss(depth: Tensor, cameras: Cameras, truth: Truth, valid: Tensor) -> Tensor:
-    """Returns ``mean(1 - cos)`` between predicted and true surface normals, averaged over strides.
+    """Returns ``mean(1 - cos)`` ``[..., B]`` between predicted and true surface normals, averaged over strides.
 
     Each pixel has four normals, one for each pair of a horizontal and a vertical neighbour (VGGT's cross products of
     point-map differences). A normal counts if the pixel and both neighbours are valid.
 
     Args:
-        depth: ``[V, H, W]`` predicted depth, in the truth's unit.
-        cameras: predicted cameras (B = 1). If they require a gradient, or depth is not on a CPU, plain torch is used.
-        truth: ground truth of one scene.
-        valid: ``[V, H, W]`` bool.
+        depth: ``[..., B, V, H, W]`` predicted depth, in the truth's unit.
+        cameras: predicted cameras ``[..., B, V]``. If they require a gradient, or depth is not on a CPU, plain torch is
+            used.
+        truth: ground truth of the B scenes.
+        valid: ``[B, V, H, W]`` bool.
     """
     fixed = not (cameras.world_to_camera.requires_grad or cameras.intrinsics.requires_grad)
     if fixed and depth.device.type == "cpu" and depth.dtype in (torch.float32, torch.float64):
-        intrinsics = (cameras.intrinsics[0], truth.cameras.intrinsics[0])
-        return PointNormals.apply(depth, truth.depth[0], valid, *intrinsics, _turn(cameras, truth), POINT_STRIDES)
+        maps = (depth, truth.depth.expand_as(depth), valid.expand_as(depth))
+        poses = (cameras.intrinsics, truth.cameras.intrinsics.expand_as(cameras.intrinsics), _turn(cameras, truth))
+        scenes = zip(*(part.flatten(0, depth.dim() - 4) for part in (*maps, *poses)), strict=True)
+        losses: list[Tensor] = [PointNormals.apply(*scene, POINT_STRIDES) for scene in scenes]  # pyright: ignore
+        return torch.stack(losses).view(depth.shape[:-3])
     return point_normal_reference(depth, cameras, truth, valid)
 
 
 def point_normal_reference(depth: Tensor, cameras: Cameras, truth: Truth, valid: Tensor) -> Tensor:
     """:func:`point_normal_loss` in plain torch, for any device; also differentiable in the cameras."""
-    turn = _turn(cameras, truth)
+    turn = _turn(cameras, truth)[..., None, None, :, :]
+    slopes, true_slopes = (ray_slopes(own.intrinsics, own.size) for own in (cameras, truth.cameras))
     total = depth.new_zeros(())
     for stride in POINT_STRIDES:
-        predicted = _corner_normals(depth, cameras.intrinsics[0], stride)
-        true = _corner_normals(truth.depth[0], truth.cameras.intrinsics[0], stride)
-        true = (turn @ true.flatten(4)).view_as(true)
-        lengths = (predicted.square().sum(3) * true.square().sum(3)).sqrt()
-        cosine = (predicted * true).sum(3) / lengths  # [2, 2, V, h - 1, w - 1]
-        mask = valid[:, ::stride, ::stride]
-        across, down = mask[..., 1:] & mask[..., :-1], mask[:, 1:] & mask[:, :-1]
-        both = _at_corners(across, -2)[None] & _at_corners(down, -1)[:, None]
-        total = total + ((1 - cosine) * both).sum() / both.sum().clamp(min=1)
+        predicted = _corner_normals(depth, cameras.intrinsics, slopes, stride)
+        true = _corner_normals(truth.depth, truth.cameras.intrinsics, true_slopes, stride)
+        true = (turn @ true.flatten(-2)).view_as(predicted)
+        lengths = (predicted.square().sum(-3) * true.square().sum(-3)).sqrt()
+        cosine = (predicted * true).sum(-3) / lengths  # [..., B, V, 2, 2, h - 1, w - 1]
+        mask = valid[..., ::stride, ::stride]
+        across, down = mask[..., 1:] & mask[..., :-1], mask[..., 1:, :] & mask[..., :-1, :]
+        both = _at_corners(across, -2)[..., None, :, :, :] & _at_corners(down, -1)[..., None, :, :]
+        corners = (-5, -4, *MAPS)
+        total = total + ((1 - cosine) * both).sum(corners) / both.sum(corners).clamp(min=1)
     return total / len(POINT_STRIDES)
 
 
 def _at_corners(between: Tensor, dim: int) -> Tensor:
-    """Stacks the values at positions i and i + 1 along ``dim``: ``[2, ...]``."""
+    """Stacks the values at positions i and i + 1 along ``dim`` of ``[..., h, w]``: ``[..., 2, h, w]``."""
     count = between.shape[dim] - 1
-    return torch.stack((between.narrow(dim, 0, count), between.narrow(dim, 1, count)))
+    return torch.stack((between.narrow(dim, 0, count), between.narrow(dim, 1, count)), -3)
 
 
-def _corner_normals(depth: Tensor, intrinsics: Tensor, stride: int) -> Tensor:
-    """Returns camera-frame normals ``[2, 2, V, 3, h - 1, w - 1]`` at the corners of 2x2 squares of the strided depth.
+def _corner_normals(depth: Tensor, intrinsics: Tensor, slopes: tuple[Tensor, Tensor], stride: int) -> Tensor:
+    """Returns camera-frame normals ``[..., 2, 2, 3, h - 1, w - 1]`` at the corners of 2x2 squares of strided depth.
 
-    The first two axes select the corner whose neighbours are to the right or left, and below or above. Computed as in
-    :mod:`vg2gt.geometry.normals`, with ``gx = fx (d1 - d) / d1``; not of unit length.
+    The axes of length two select the corner whose neighbours are to the right or left, and below or above. Computed as
+    in :mod:`vg2gt.geometry.normals`, with ``gx = fx (d1 - d) / d1``; not of unit length.
     """
-    u, v = ray_slopes(intrinsics, (depth.shape[-2], depth.shape[-1]))
-    u, v = u[..., ::stride], v[..., ::stride, :]
-    depth = depth[:, ::stride, ::stride]
-    fx, fy = intrinsics[:, 0, 0, None, None] / stride, intrinsics[:, 1, 1, None, None] / stride
-    x = fx * depth.diff(dim=2) / torch.stack((depth[..., 1:], depth[..., :-1]))  # [2, V, h, w - 1]
-    y = fy * depth.diff(dim=1) / torch.stack((depth[:, 1:], depth[:, :-1]))  # [2, V, h - 1, w]
-    x, y = torch.stack((x[:, :, :-1], x[:, :, 1:]), 1), torch.stack((y[..., :-1], y[..., 1:]))
-    z = -1 - _at_corners(u, -1)[:, None] * x - _at_corners(v, -2) * y
-    return torch.stack((x, y, z), 3)
+    u, v = slopes[0][..., ::stride], slopes[1][..., ::stride, :]
+    depth = depth[..., ::stride, ::stride]
+    fx, fy = (intrinsics[..., i, i, None, None] / stride for i in range(2))
+    columns = torch.stack((depth[..., 1:], depth[..., :-1]), -3)
+    rows = torch.stack((depth[..., 1:, :], depth[..., :-1, :]), -3)
+    x = (fx * depth.diff(dim=-1))[..., None, :, :] / columns  # [..., 2, h, w - 1]
+    y = (fy * depth.diff(dim=-2))[..., None, :, :] / rows  # [..., 2, h - 1, w]
+    x, y = _at_corners(x, -2), torch.stack((y[..., :-1], y[..., 1:]), -4)
+    z = -1 - _at_corners(u, -1)[..., None, :, :] * x - _at_corners(v, -2)[..., None, :, :, :] * y
+    return torch.stack((x, y, z), -3)
 
 
 def _turn(cameras: Cameras, truth: Truth) -> Tensor:
-    """Returns rotations ``[V, 3, 3]`` from the true cameras' frames to the predicted ones'."""
-    return cameras.world_to_camera[0, :, :3, :3] @ truth.cameras.world_to_camera[0, :, :3, :3].transpose(-1, -2)
+    """Returns rotations ``[..., B, V, 3, 3]`` from the true cameras' frames to the predicted ones'."""
+    return cameras.world_to_camera[..., :3, :3] @ truth.cameras.world_to_camera[..., :3, :3].transpose(-1, -2)

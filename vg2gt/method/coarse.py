@@ -165,7 +165,7 @@ class CoarseModule(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Pools to voxels, runs PTv3, interpolates at the points: features ``[N, C]`` and gate ``[B, 1, 1, 1]``."""
         with full_precision(embedded):
-            plan = plan_voxels(points.cells, points.batch, torch.ones_like(points.batch, dtype=torch.bool))
+            plan = plan_voxels(points.cells, points.batch)
             pooled = pool_mean(embedded, points.confidence, plan)  # f_m^v, eqn voxelfeature: [M, C]
             least = pool_min(points.confidence, plan)  # n_m^v, eqn voxelfeature: [M]
             centroid = cell_centroids(points.cells, points.confidence, plan) if self.surface_evidence else None

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from vg2gt.geometry.cameras import camera_centers, focal_lengths, unproject
-from vg2gt.geometry.precision import full_precision
+from vg2gt.geometry.precision import Float32Linear, full_precision
 from vg2gt.geometry.symmetric import UPPER
 from vg2gt.kernels.point_features import PooledFeatures
 from vg2gt.kernels.threads import compilable
@@ -100,7 +100,7 @@ class FineModule(nn.Module):
         self.cap = Cap("model.fine.max_voxels", max_voxels, "voxels", "least confident")
         self.dense_head = dense_head(token_dims=token_dims, patch_size=patch_size)
         width = self.dense_head.out_channels
-        self.point_offset = nn.Linear(3, width, bias=False)
+        self.point_offset = Float32Linear(3, width, bias=False)
         self.moments = moments
         self.normal_kernel = normal_kernel
         self.drop_fringes = drop_fringes
@@ -141,7 +141,7 @@ class FineModule(nn.Module):
         # pixels to points and their cells
         with full_precision(images):
             points = _Points(geometry, size, self.drop_fringes)
-            plan = plan_voxels(points.cells, points.batch, points.valid)
+            plan = plan_voxels(points.cells, points.batch, points.valid, points.valid_count)
             note_sizes({"voxels": len(plan)})
             if capped and self.cap.limit is not None:
                 keep = self.cap(pool_min(points.confidence.detach(), plan), plan.batch)
@@ -246,7 +246,7 @@ class _Points:
         near = in_range(self.cells.detach())
         self.valid = usable.flatten() & near
         self.offset = (self.cells - self.cells.detach().floor() - 0.5).float()
-        far = int((usable.flatten() & ~near).sum())
+        far, self.valid_count = torch.stack(((usable.flatten() & ~near).sum(), self.valid.sum())).tolist()
         if far:
             log.warning("ignored %d of %d points: too far from the origin for the voxel grid", far, usable.numel())
 

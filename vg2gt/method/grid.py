@@ -116,13 +116,14 @@ def in_range(cells: Tensor) -> Tensor:
     return (cells.abs() < MAX_CELLS).all(-1)
 
 
-def plan_voxels(cells: Tensor, batch: Tensor, valid: Tensor) -> VoxelPlan:
+def plan_voxels(cells: Tensor, batch: Tensor, valid: Tensor | None = None, valid_count: int | None = None) -> VoxelPlan:
     """Groups points by cell.
 
     Args:
         cells: ``[N, 3]`` positions in units of voxels; invalid rows may hold anything.
         batch: ``[N]`` int64 scene index.
-        valid: ``[N]`` bool, the points to use; they must be finite.
+        valid: ``[N]`` bool, the points to use, which must be finite; None: all.
+        valid_count: their number; None: counted, which synchronises with a GPU once more.
 
     Returns:
         The plan. It is deterministic, and only the order within a voxel depends on the order of points.
@@ -130,8 +131,9 @@ def plan_voxels(cells: Tensor, batch: Tensor, valid: Tensor) -> VoxelPlan:
     Raises:
         ValueError: if the points span more cells than 63 bits can index.
     """
-    valid_rows = valid.nonzero()[:, 0]
-    rows = None if len(valid_rows) == len(valid) else valid_rows
+    rows = None
+    if valid is not None and valid_count != len(batch):
+        rows = valid.nonzero()[:, 0] if valid_count is None else _marked(valid, valid_count)
     floors = torch.floor(cells.detach() if rows is None else cells.detach()[rows]).long()
     scenes = batch if rows is None else batch[rows]
     keys, order = torch.sort(mixed_radix_keys(floors, scenes)[0], stable=True)
@@ -142,6 +144,13 @@ def plan_voxels(cells: Tensor, batch: Tensor, valid: Tensor) -> VoxelPlan:
     voxel_of = torch.full_like(batch, -1)
     voxel_of[point_rows] = inverse
     return VoxelPlan(floors[first], scenes[first], point_rows, starts, counts, voxel_of)
+
+
+def _marked(mask: Tensor, count: int) -> Tensor:
+    """Returns the ``count`` rows where a mask is true; unlike ``nonzero``, never synchronises."""
+    place = torch.where(mask, mask.cumsum(0) - 1, count)  # all others share the last place, which is dropped
+    rows = torch.arange(len(mask), device=mask.device)
+    return rows.new_empty(count + 1).scatter_(0, place, rows)[:count]
 
 
 class _WeightedMean(torch.autograd.Function):

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.utils.checkpoint import checkpoint
 
+from vg2gt.geometry.precision import Float32Linear
 from vg2gt.method.grid import scene_counts
 from vg2gt.method.serialization import Order, Windows, make_windows, relative_grid, serial_keys
 
@@ -42,7 +43,7 @@ class GeometricStage(nn.Module):
         super().__init__()
         self.alpha = nn.Parameter(torch.ones(channels + 3))
         self.beta = nn.Parameter(torch.zeros(channels + 3))
-        self.inner = nn.Linear(2 * channels + 3, channels)
+        self.inner = Float32Linear(2 * channels + 3, channels)
         self.before = _ResidualPointBlock(channels)
         self.after = _ResidualPointBlock(channels)
         self.out = nn.Linear(2 * channels, channels)
@@ -139,9 +140,7 @@ class PointMLP(nn.Module):
 
     def _windows(self, grid: Tensor, batch: Tensor, voxel_size: Tensor) -> list[Windows]:
         orders = STAGE_ORDERS[: len(self.stages)]
-        counts = scene_counts(batch, len(voxel_size)).tolist()
-        curves = [torch.argsort(key) for key in serial_keys(grid, batch, voxel_size, orders)]
-        return [
-            make_windows(curves[i % len(curves)], counts, self.window, self.window // 2 * (i % 2))
-            for i in range(len(self.stages))
-        ]
+        *counts, last = torch.cat((scene_counts(batch, len(voxel_size)), grid.max()[None])).tolist()
+        curves = [torch.argsort(key) for key in serial_keys(grid, batch, voxel_size, orders, extent=last + 1)]
+        windows = [make_windows(counts, self.window, grid.device, shift) for shift in (0, self.window // 2)]
+        return [windows[i % 2].along(curves[i % len(curves)]) for i in range(len(self.stages))]

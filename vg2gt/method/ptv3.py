@@ -29,7 +29,7 @@ class Level:
         grid: ``[M, 3]`` int64 cells.
         batch: ``[M]`` scene index, sorted.
         counts: number of voxels per scene.
-        keys: sort keys of every serialisation order.
+        keys: ``[orders, M]`` sort keys of every serialisation order.
         generator: shuffles the orders, so that blocks use them in random sequence; None keeps the sequence.
         parent_of: ``[M]`` parent of each voxel in the next level; at the last level, the voxel itself.
         order: ``[M]`` voxels sorted by parent; None if they are already sorted.
@@ -38,7 +38,7 @@ class Level:
     grid: Tensor
     batch: Tensor
     counts: list[int]
-    keys: list[Tensor]
+    keys: Tensor
     generator: torch.Generator | None
     parent_of: Tensor
     order: Tensor | None = None
@@ -48,13 +48,16 @@ class Level:
         drawn = torch.randperm(count, generator=self.generator).tolist() if self.generator else list(range(count))
         self.sequence: list[int] = drawn
         self._windows: dict[tuple[int, int], Windows] = {}
+        self._positions: dict[int, Windows] = {}  # of the same windows on any curve, by length
         self.pairs: dict[int, Pairs | NeighborTable] = {}
 
     def windows(self, order: int, length: int) -> Windows:
         """Returns the attention windows along the curve of block number ``order``."""
         which = self.sequence[order % len(self.sequence)]
         if (which, length) not in self._windows:
-            self._windows[which, length] = make_windows(torch.argsort(self.keys[which]), self.counts, length)
+            if length not in self._positions:
+                self._positions[length] = make_windows(self.counts, length, self.grid.device)
+            self._windows[which, length] = self._positions[length].along(torch.argsort(self.keys[which]))
         return self._windows[which, length]
 
 
@@ -62,7 +65,7 @@ def _make_levels(
     grid: Tensor,
     batch: Tensor,
     scenes: int,
-    keys: list[Tensor],
+    keys: Tensor,
     extent: Sequence[int],
     kernels: Sequence[Sequence[int]],
     generator: torch.Generator | None,
@@ -73,7 +76,7 @@ def _make_levels(
         grid: ``[M, 3]`` int64 cells relative to their scene's smallest.
         batch: ``[M]`` scene index, sorted.
         scenes: B.
-        keys: sort keys of every order at the finest level.
+        keys: ``[orders, M]`` sort keys at the finest level.
         extent: cells along each axis.
         kernels: kernel edge lengths of the convolutions at each level, finest first.
         generator: shuffles every level's orders.
@@ -92,7 +95,7 @@ def _make_levels(
         if s:  # one voxel per cell; cells are sorted along the curve
             place = torch.searchsorted(in_cell[s], torch.arange(sum(counts[s]), device=device))
             first = order[place]
-            rows = (grid[first] >> s, batch[first], counts[s], [key[first] >> 3 * s for key in keys])
+            rows = (grid[first] >> s, batch[first], counts[s], keys[:, first] >> 3 * s)
             levels.append(Level(*rows, generator, below[place]))
         else:
             parent_of = torch.empty_like(order).scatter_(0, order, below)
@@ -179,14 +182,14 @@ class _PTv3Block(nn.Module):
         conv, linear, norm = self.cpe
         x = conv(features if conv_input is None else conv_input, level.pairs[3])
         features = features + norm(linear(x))
-        features = features + self._drop(self.attn(self.norm1[0](features), level))
-        return features + self._drop(self.mlp[0](self.norm2[0](features)))
-
-    def _drop(self, branch: Tensor) -> Tensor:
+        attended = self.attn(self.norm1[0](features), level)
         if not (self.training and self.drop_path):
-            return branch
-        kept = torch.rand(len(branch), 1, device=branch.device) >= self.drop_path
-        return branch * kept / (1 - self.drop_path)
+            features = features + attended
+            return features + self.mlp[0](self.norm2[0](features))
+        share = 1 - self.drop_path  # of the voxels that keep a branch, which is scaled to the same mean
+        kept = torch.empty(2, len(features), 1, device=features.device).bernoulli_(share) / share
+        features = features + attended * kept[0]
+        return features + self.mlp[0](self.norm2[0](features)) * kept[1]
 
 
 class _GridPool(nn.Module):

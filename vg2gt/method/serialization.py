@@ -16,16 +16,20 @@ ORDERS: tuple[Order, ...] = get_args(Order)
 MAX_BITS = 21  # per axis; a code has three times as many bits of an int64
 
 
-def serial_codes(grid: Tensor, bits: int, order: Order) -> Tensor:
-    """Returns the codes ``[M]`` of cells ``[M, 3]`` in one of the orders; the transposed orders exchange x and y.
+def serial_codes(grid: Tensor, bits: int, orders: Sequence[Order]) -> list[Tensor]:
+    """Returns the codes ``[M]`` of cells ``[M, 3]`` in each of the orders; the transposed orders exchange x and y.
 
     Each unused leading bit rotates a Hilbert curve by a third of a full turn. Rounding the number of bits up to a
     multiple of three makes a cell's code independent of ``bits``, and so of the other scenes in a batch.
     """
-    if order.endswith("-trans"):
-        x, y, z = grid.unbind(-1)
-        grid = torch.stack((y, x, z), -1)
-    return z_codes(grid) if order.startswith("z") else hilbert_codes(grid, -(-bits // 3) * 3)
+    x, y, z = grid.unbind(-1)
+    both = torch.cat((grid, torch.stack((y, x, z), -1)))  # all curves of a kind at once
+    codes = {}
+    if any(order.startswith("z") for order in orders):
+        codes["z"], codes["z-trans"] = z_codes(both).chunk(2)
+    if any(order.startswith("hilbert") for order in orders):
+        codes["hilbert"], codes["hilbert-trans"] = hilbert_codes(both, -(-bits // 3) * 3).chunk(2)
+    return [codes[order] for order in orders]
 
 
 def relative_grid(grid: Tensor, batch: Tensor, scenes: int) -> Tensor:
@@ -42,8 +46,8 @@ def serial_keys(
     orders: Sequence[Order],
     min_bits: int = 1,
     extent: int | None = None,
-) -> list[Tensor]:
-    """Returns sort keys ``scene << (3 * bits) | code``, one ``[M]`` tensor per order.
+) -> Tensor:
+    """Returns sort keys ``scene << (3 * bits) | code``: ``[orders, M]``.
 
     Args:
         grid: ``[M, 3]`` cells relative to their scene's smallest.
@@ -64,8 +68,7 @@ def serial_keys(
             f"a scene spans {extent} voxels along one axis (voxel size {sizes}, {scenes} scenes), too many for "
             "63-bit serial codes; increase voxel_size or min_footprint"
         )
-    scene = batch << (3 * bits)
-    return [scene | serial_codes(grid, bits, order) for order in orders]
+    return (batch << (3 * bits)) | torch.stack(serial_codes(grid, bits, orders))
 
 
 @dataclass(frozen=True)
@@ -96,14 +99,19 @@ class Windows:
     groups: tuple[_WindowGroup, ...]
     owner: Tensor
 
+    def along(self, order: Tensor) -> Windows:
+        """Returns windows of positions on a curve as windows of the voxels ``order`` ``[M]`` along it."""
+        groups = tuple(_WindowGroup(order[group.rows], group.counts) for group in self.groups)
+        return Windows(groups, torch.empty_like(order).scatter_(0, order, self.owner))
 
-def make_windows(order: Tensor, counts: list[int], length: int, shift: int = 0) -> Windows:
-    """Cuts the serialised voxels of every scene into windows.
+
+def make_windows(counts: list[int], length: int, device: torch.device, shift: int = 0) -> Windows:
+    """Cuts the positions along a curve into windows, for :meth:`Windows.along`.
 
     Args:
-        order: ``[M]`` voxels along the curve, scene after scene.
         counts: number of voxels per scene.
         length: voxels per window; a scene with fewer voxels is a single window.
+        device: device of the curve.
         shift: the first window starts this many voxels before the scene, 0 <= shift < length.
     """
     by_length: dict[int, list[tuple[int, int]]] = {}
@@ -113,17 +121,21 @@ def make_windows(order: Tensor, counts: list[int], length: int, shift: int = 0) 
             by_length.setdefault(min(length, count), []).append((begin, count))
         begin += count
     groups, base = [], 0
-    owner = torch.empty_like(order)
+    owners: dict[int, Tensor] = {}
     for size, scenes in by_length.items():
         rows = []
         for begin, count in scenes:
-            voxels = order[begin : begin + count]
             first = -shift if count > length else 0
-            inside = torch.arange(first, count, size, device=order.device).clamp(0, count - size)  # [W]
-            place = torch.arange(count, device=order.device)
-            window = (place - first) // size
-            owner[voxels] = base + window * size + place - inside[window]
-            rows.append(voxels[inside[:, None] + torch.arange(size, device=order.device)])  # [W, K]
+            starts = torch.arange(first, count, size, device=device)  # [W]
+            inside = starts.clamp(0, count - size)
+            moved = starts - inside + (base - first)  # from a place in the scene to one in the windows
+            place = torch.arange(count, device=device)
+            owners[begin] = place + moved[(place - first) // size]
+            rows.append((inside + begin)[:, None] + torch.arange(size, device=device))  # [W, K]
             base += len(inside) * size
-        groups.append(_WindowGroup(torch.cat(rows), tuple(map(len, rows))))
-    return Windows(tuple(groups), owner)
+        groups.append(_WindowGroup(_cat(rows), tuple(map(len, rows))))
+    return Windows(tuple(groups), _cat([owners[begin] for begin in sorted(owners)]))
+
+
+def _cat(parts: list[Tensor]) -> Tensor:
+    return parts[0] if len(parts) == 1 else torch.cat(parts)

@@ -5,6 +5,7 @@ On a CPU, kernel offsets are processed one at a time; on other devices, as many 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -43,17 +44,28 @@ class NeighborTable:
         sources: ``[T, P + 1]`` rows of the neighbours, padded with M; the last column is always padding.
         targets: ``[T, P + 1]`` rows of the voxels that have these neighbours, padded with M.
         slots: ``[M, T]`` index of a voxel's neighbour in ``sources.flatten()``; without one, the last of its row.
+        back: ``[M, T]`` index in ``targets.flatten()`` of the voxel whose neighbour a voxel is; likewise.
+        bags: ``[M]`` first index of each voxel in ``slots.flatten()``.
     """
 
     sources: Tensor
     targets: Tensor
     slots: Tensor
+    back: Tensor
+    bags: Tensor
 
     def parts(self, width: int) -> Iterator[slice]:
         """Returns slices of offsets whose rows of ``width`` elements may be held together."""
         offsets, rows = self.sources.shape
         some = max(1, HELD // (rows * width))
         return (slice(begin, min(begin + some, offsets)) for begin in range(0, offsets, some))
+
+    def sums(self, products: Tensor, slots: Tensor, some: slice) -> Tensor:
+        """Returns each voxel's sum ``[M, C]`` of the products ``[t, P + 1, C]`` at its ``slots`` or ``back``."""
+        rows = products.flatten(0, 1)
+        if len(products) == slots.shape[1]:
+            return F.embedding_bag(slots.flatten(), rows, self.bags, mode="sum")
+        return F.embedding_bag(slots[:, some] - some.start * self.sources.shape[1], rows, mode="sum")
 
 
 def neighbors(cells: Sequence[Cells]) -> list[Pairs] | list[NeighborTable]:
@@ -70,10 +82,31 @@ def one_by_one(device: torch.device) -> bool:
 
 def neighbor_tables(cells: Sequence[Cells]) -> list[NeighborTable]:
     """Returns one table per set of cells; synchronises once, for the largest number of pairs at an offset."""
-    found = [_neighbor_rows(*each) for each in cells]
-    most = torch.stack([there.sum(1).amax() if there.numel() else there.new_zeros((), dtype=torch.int64)
-                        for there in (rows < rows.shape[1] for rows in found)])  # fmt: skip
-    return [_tabulate(rows, most) for rows, most in zip(found, most.tolist(), strict=True)]
+    alike: dict[tuple[int, int | None], list[int]] = {}  # sets of one kernel size are searched together
+    for index, each in enumerate(cells):
+        alike.setdefault((each.kernel_size, index if each.spans is None else None), []).append(index)
+    found = [torch.empty(0)] * len(cells)
+    for sets in alike.values():
+        for index, rows in zip(sets, _rows_of_sets([cells[index] for index in sets]), strict=True):
+            found[index] = rows
+    ranks = [(rows < rows.shape[1]).cumsum(1) for rows in found]  # of the voxels that have a neighbour at an offset
+    most = [rank[:, -1].amax() if rank.numel() else rank.new_zeros(()) for rank in ranks]
+    return [_tabulate(*each) for each in zip(found, ranks, torch.stack(most).tolist(), strict=True)]
+
+
+def _rows_of_sets(cells: Sequence[Cells]) -> list[Tensor]:
+    """:func:`_neighbor_rows` of each set of cells; several, which must have spans, become scenes of a single one."""
+    if len(cells) == 1:
+        return [_neighbor_rows(*cells[0])]
+    *extent, scenes = (max(each) for each in zip(*(part.spans or () for part in cells), strict=True))
+    grid = torch.cat([part.grid for part in cells])
+    batch = torch.cat([part.batch + i * scenes for i, part in enumerate(cells)])
+    rows = _neighbor_rows(grid, batch, cells[0].kernel_size, (*extent, scenes * len(cells)))
+    counts = [len(part.grid) for part in cells]
+    begins = itertools.accumulate(counts, initial=0)
+    # no neighbours, marked by the total number of cells, are marked by the set's
+    own = zip(rows.split(counts, 1), begins, counts, strict=False)
+    return [(part - begin).clamp_(max=count) for part, begin, count in own]
 
 
 def _neighbor_rows(grid: Tensor, batch: Tensor, kernel_size: int, spans: Sequence[int] | None = None) -> Tensor:
@@ -90,16 +123,19 @@ def _neighbor_rows(grid: Tensor, batch: Tensor, kernel_size: int, spans: Sequenc
     return torch.cat((before, after.flip(0)))
 
 
-def _tabulate(rows: Tensor, most: int) -> NeighborTable:
-    """Builds the table from neighbour rows ``[T, M]``, with at most ``most`` neighbours per offset."""
+def _tabulate(rows: Tensor, ranks: Tensor, most: int) -> NeighborTable:
+    """Builds the table from neighbour rows and their ranks ``[T, M]``, with at most ``most`` neighbours per offset."""
     offsets, count = rows.shape
-    there = rows < count
-    column = torch.where(there, there.cumsum(1) - 1, most)
+    column = torch.where(rows < count, ranks - 1, most)
     sources, targets = (rows.new_full((offsets, most + 1), count) for _ in range(2))
     sources.scatter_(1, column, rows)
-    targets.scatter_(1, column, torch.where(there, torch.arange(count, device=rows.device), count))
-    slots = column + (most + 1) * torch.arange(offsets, device=rows.device)[:, None]
-    return NeighborTable(sources, targets, slots.t().contiguous())
+    voxels = torch.arange(count, device=rows.device)
+    targets.scatter_(1, column, voxels.expand(offsets, -1))
+    targets[:, -1] = count
+    # a last column for voxels that are nobody's neighbour; whose neighbour a voxel is, the opposite offset tells
+    slots = F.pad(column, (0, 1), value=most) + (most + 1) * torch.arange(offsets, device=rows.device)[:, None]
+    back = slots.gather(1, rows.flip(0))
+    return NeighborTable(sources, targets, *(x.t().contiguous() for x in (slots[:, :-1], back)), bags=voxels * offsets)
 
 
 def neighbor_pairs(grid: Tensor, batch: Tensor, kernel_size: int, spans: Sequence[int] | None = None) -> Pairs:
@@ -147,29 +183,37 @@ class _BatchedConvolution(torch.autograd.Function):
     """Gathers, multiplies and sums many kernel offsets at once; the backward pass gathers again."""
 
     @staticmethod
-    def forward(ctx: Any, features: Tensor, weight: Tensor, table: NeighborTable) -> Tensor:
-        """Returns ``[M, out]`` for ``features [M, in]`` and ``weight [out, k, k, k, in]``."""
+    def forward(ctx: Any, features: Tensor, weight: Tensor, bias: Tensor | None, table: NeighborTable) -> Tensor:
+        """Returns ``[M, out]`` for ``features [M, in]``, ``weight [out, k, k, k, in]`` and ``bias [out]``.
+
+        Products have the dtype of the weight, sums that of the features.
+        """
         taps, center = _taps(weight)
-        ctx.save_for_backward(features, weight)
-        ctx.table = table
-        return _sum_products(features, taps, center, table)
+        padded = _padded(features, weight.dtype)
+        product = padded[:-1] @ center
+        out = product.to(features.dtype) if bias is None else product + bias
+        for some in table.parts(taps.shape[1] + taps.shape[2]):
+            out += table.sums(padded[table.sources[some]] @ taps[some], table.slots, some)
+        ctx.save_for_backward(padded, weight)
+        ctx.table, ctx.dtype = table, features.dtype
+        return out
 
     @staticmethod
-    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, Tensor, None]:  # pyright: ignore
-        """Returns the gradients of the features and the weight."""
-        features, weight = ctx.saved_tensors
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore
+        """Returns the gradients of the features, the weight and the bias."""
+        padded, weight = ctx.saved_tensors
         table: NeighborTable = ctx.table
-        grad = grad_outputs[0].to(features.dtype)
+        padded_grad = _padded(grad_outputs[0], padded.dtype)
+        features, grad = padded[:-1], padded_grad[:-1]
         taps, center = _taps(weight)
-        grad_features = _sum_products(grad, taps.flip(0).mT, center.t(), table).to(features.dtype)
-        of_taps = torch.empty_like(taps)
-        padded_grad, padded = (F.pad(rows, (0, 0, 0, 1)) for rows in (grad, features))
+        grad_features, of_taps = (grad @ center.t()).to(ctx.dtype), []
         for some in table.parts(grad.shape[1] + features.shape[1]):
-            pairs = (padded[table.sources[some]], padded_grad[table.targets[some]])  # [t, P + 1, in], [t, P + 1, out]
-            of_taps[some] = pairs[0].mT @ pairs[1]
-        half = len(taps) // 2
-        of_all = torch.cat((of_taps[:half], (features.t() @ grad)[None], of_taps[half:]))  # [k^3, in, out]
-        return grad_features, of_all.permute(2, 0, 1).reshape(weight.shape), None
+            rows, grad_rows = padded[table.sources[some]], padded_grad[table.targets[some]]  # [t, P + 1, in or out]
+            of_taps += (rows.mT @ grad_rows).unbind()
+            grad_features += table.sums(grad_rows @ taps[some].mT, table.back, some)
+        of_taps.insert(len(of_taps) // 2, features.t() @ grad)
+        of_weight = torch.stack(of_taps).permute(2, 0, 1).reshape(weight.shape)  # from [k^3, in, out]
+        return grad_features, of_weight, grad_outputs[0].sum(0) if ctx.needs_input_grad[2] else None, None
 
 
 def _taps(weight: Tensor) -> tuple[Tensor, Tensor]:
@@ -179,15 +223,11 @@ def _taps(weight: Tensor) -> tuple[Tensor, Tensor]:
     return torch.cat((taps[:half], taps[half + 1 :])), taps[half]
 
 
-def _sum_products(features: Tensor, taps: Tensor, center: Tensor, table: NeighborTable) -> Tensor:
-    """Returns ``[M, out]`` in float32 or better: the sum of every voxel's own product and its neighbours' products."""
-    out = (features @ center).to(torch.promote_types(features.dtype, torch.float32))
-    padded = F.pad(features, (0, 0, 0, 1))
-    for some in table.parts(taps.shape[1] + taps.shape[2]):
-        products = (padded[table.sources[some]] @ taps[some]).flatten(0, 1)  # [t (P + 1), out]
-        slots = table.slots[:, some] - some.start * table.sources.shape[1] if some.start else table.slots[:, some]
-        out += F.embedding_bag(slots, products, mode="sum")
-    return out
+def _padded(rows: Tensor, dtype: torch.dtype) -> Tensor:
+    """Converts rows ``[M, C]`` and appends one of zeros."""
+    padded = rows.new_zeros(len(rows) + 1, rows.shape[1], dtype=dtype)
+    padded[:-1] = rows
+    return padded
 
 
 class _SubmanifoldConvolution(torch.autograd.Function):
@@ -257,7 +297,9 @@ class SubmanifoldConv3d(nn.Module):
         """
         weight = self.weight
         if torch.is_autocast_enabled(features.device.type):
-            features, weight = features.to(autocast_dtype(features)), weight.to(autocast_dtype(features))
-        convolve = _BatchedConvolution if isinstance(pairs, NeighborTable) else _SubmanifoldConvolution
-        out: Tensor = convolve.apply(features, weight, pairs)  # pyright: ignore
+            weight = weight.to(autocast_dtype(features))
+        if isinstance(pairs, NeighborTable):
+            features = features.to(torch.promote_types(features.dtype, torch.float32))
+            return _BatchedConvolution.apply(features, weight, self.bias, pairs)  # pyright: ignore
+        out: Tensor = _SubmanifoldConvolution.apply(features.to(weight.dtype), weight, pairs)  # pyright: ignore
         return out if self.bias is None else out + self.bias

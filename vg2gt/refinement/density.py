@@ -101,7 +101,7 @@ def merged(gaussians: Gaussians, cell: float) -> Gaussians:
         cell: edge of the cells in scene units.
     """
     cells = point_cells(gaussians.means, gaussians.batch, gaussians.means.new_tensor([cell]))
-    plan = plan_voxels(cells, gaussians.batch, torch.ones_like(gaussians.batch, dtype=torch.bool))
+    plan = plan_voxels(cells, gaussians.batch)
 
     weights = gaussians.opacities.clamp(min=1e-6)  # a cell may hold only transparent Gaussians
 

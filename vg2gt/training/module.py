@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, Literal, get_args
 
 import lightning
@@ -23,6 +24,7 @@ from vg2gt.model import VG2GT, Reconstructor
 from vg2gt.profiling import stage
 from vg2gt.rendering import Renderer, UnrenderableError
 from vg2gt.runs.checkpoints import MADE_OF, MODEL_PREFIX, model_state
+from vg2gt.training.casts import WeightCasts
 from vg2gt.training.distributed import SkippedSteps, all_gather_object, finite, world_size
 from vg2gt.types import Batch, Prediction
 
@@ -91,6 +93,7 @@ class VG2GTModule(lightning.LightningModule):
         self.part = part
         if part == "coarse":
             _leave_only_coarse(model)
+        self.casts = WeightCasts(model)
         self.pose_noise = pose_noise
         self.loss = loss
         self.renderer = renderer
@@ -103,6 +106,7 @@ class VG2GTModule(lightning.LightningModule):
         self.generator = torch.Generator()
         self.skipped = SkippedSteps(max_skipped)
         self._cause: str | None = None  # why the current step must be skipped
+        self._report: LossReport | None = None  # of the current step
         self._scenes: tuple[str, ...] = ()
         self._figures: dict[str, Tensor] = {}
         self._metrics: dict[tuple[str, tuple[int, ...]], dict[str, float]] = {}
@@ -120,15 +124,14 @@ class VG2GTModule(lightning.LightningModule):
         torch.manual_seed(step_seed + self.global_rank)  # drop path
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        """Returns the training loss; NaN if the batch, prediction or loss is bad, and all ranks then skip the step."""
-        self._scenes, self._figures, self._cause = batch.scene, {}, None
-        report = self._losses(batch)
+        """Returns the training loss; NaN if batch or prediction is bad. All ranks skip a step that is not finite."""
+        self._scenes, self._figures, self._cause, self._report = batch.scene, {}, None, None
+        with self.casts(batch.images):
+            report = self._losses(batch)
         if report is not None:
+            self._report = replace(report, total=report.total.detach())
             self._figures |= self._step_figures(report)
-            if finite(report.total):
-                return report.total
-            bad = [name for name, value in report.terms.items() if not finite(value)]
-            self._cause = f"loss ({', '.join(bad) or 'finite terms, infinite sum'})"
+            return report.total
         # use every parameter, as DDP expects
         return torch.stack([parameter.sum() for parameter in self.model.trained_parameters()]).sum() * torch.nan
 
@@ -214,7 +217,8 @@ class VG2GTModule(lightning.LightningModule):
     ) -> None:
         """Clips the global gradient norm; skips the step on all ranks if a loss or gradient is non-finite on any."""
         norm = nn.utils.clip_grad_norm_(self.model.trained_parameters(), gradient_clip_val or math.inf)
-        bad = torch.ones_like(norm) if self._cause is not None else (~norm.isfinite()).to(norm.dtype)
+        good = norm.isfinite() if self._report is None else norm.isfinite() & self._report.total.isfinite()
+        bad = torch.ones_like(norm) if self._cause is not None else (~good).to(norm.dtype)
         # All ranks see the same sum, so either all skip the step or none does. The host waits here.
         bad_ranks = float(self.trainer.strategy.reduce(bad, reduce_op="sum"))
         if bad_ranks:
@@ -230,6 +234,9 @@ class VG2GTModule(lightning.LightningModule):
     def _skip_step(self) -> None:
         """Counts a skipped step and logs the fault of each rank."""
         cause = self._cause or "gradient"  # averaged, so non-finite on all ranks
+        if self._report is not None and not finite(self._report.total):
+            bad = [name for name, value in self._report.terms.items() if not finite(value)]
+            cause = f"loss ({', '.join(bad) or 'finite terms, infinite sum'})"
         found = all_gather_object(
             f"step {self.global_step}, rank {self.global_rank}, {', '.join(self._scenes)}: {cause}"
         )
