@@ -14,7 +14,7 @@ from vg2gt.kernels.threads import parallel_for
 WINDOW, SIGMA = 11, 1.5  # kornia's Gaussian has this standard deviation for every window size
 HALF = WINDOW // 2
 C1, C2 = np.float32(0.01**2), np.float32(0.03**2)
-ONE, TWO, ZERO = np.float32(1), np.float32(2), np.float32(0)
+TWO, ZERO, SHIFT = np.float32(2), np.float32(0), np.float32(0.5)
 FAST = {"contract", "nsz", "arcp"}
 _ROWS = 64  # of a plane at a time
 _WEIGHTS = np.exp(-(np.arange(-HALF, HALF + 1) ** 2) / (2 * SIGMA**2))
@@ -42,7 +42,8 @@ class Structure(torch.autograd.Function):
 def _similarity(images: np.ndarray, reference: np.ndarray, gradient: np.ndarray) -> float:
     """Returns the sum of SSIM over planes ``[C, H, W]``; writes its derivative by ``images`` into ``gradient``."""
     around = ((0, 0), (HALF, HALF), (HALF, HALF))
-    x, y = (np.pad(each, around, "reflect") for each in (images, reference))
+    # variances do not depend on the shift, and those of flat bright areas lose fewer digits
+    x, y = (np.pad(each - SHIFT, around, "reflect") for each in (images, reference))
     given = np.stack((x, y, x * x + y * y, x * y), 1)
     planes, height, width = images.shape
     # derivatives of SSIM by the windowed means of x, x^2 + y^2 and x y, with zeros around
@@ -83,10 +84,10 @@ def _folded(padded: np.ndarray) -> np.ndarray:
 def _compare(given, weights, derivatives, first, last):
     """Returns the sum of SSIM over some rows of one plane.
 
-    ``SSIM = n1 n2 / (d1 d2)`` with ``n1 = 2 a b + C1``, ``d1 = a^2 + b^2 + C1``, ``n2 = 2 (r - a b) + C2`` and
-    ``d2 = s - a^2 - b^2 + C2``; a, b, s and r are the windowed means of image, reference, the sum of their squares and
-    their product. Writes the derivatives by a, s (doubled, because x^2 has the derivative 2 x) and r. LLVM vectorises
-    none of the loops if they write to more arrays.
+    ``SSIM = n1 n2 / (d1 d2)`` with ``n1 = 2 u v + C1``, ``d1 = u^2 + v^2 + C1``, ``n2 = 2 (r - a b) + C2`` and
+    ``d2 = s - a^2 - b^2 + C2``; a, b, s and r are the windowed means of the shifted image, the shifted reference, the
+    sum of their squares and their product, and u, v are a, b without the shift. Writes the derivatives by a, s
+    (doubled, because x^2 has the derivative 2 x) and r. LLVM vectorises none of the loops if they write to more arrays.
     """
     padded = given.shape[2]
     width = padded - 2 * HALF
@@ -98,23 +99,25 @@ def _compare(given, weights, derivatives, first, last):
         _across(down, weights, across)
         a, b, s, r = across
         for j in range(width):
-            product, squares = a[j] * b[j], a[j] * a[j] + b[j] * b[j]
-            top = (TWO * product + C1) * (TWO * (r[j] - product) + C2)
-            similarity[j] = top / ((squares + C1) * (s[j] - squares + C2))
+            u, v = a[j] + SHIFT, b[j] + SHIFT
+            top = (TWO * u * v + C1) * (TWO * (r[j] - a[j] * b[j]) + C2)
+            similarity[j] = top / ((u * u + v * v + C1) * (s[j] - a[j] * a[j] - b[j] * b[j] + C2))
         row = i + 2 * HALF
         out = derivatives[0, row][2 * HALF :]
         for j in range(width):
-            product, squares = a[j] * b[j], a[j] * a[j] + b[j] * b[j]
-            n1, d1 = TWO * product + C1, squares + C1
-            n2, d2 = TWO * (r[j] - product) + C2, s[j] - squares + C2
-            out[j] = TWO * (b[j] * (n2 - n1) + a[j] * similarity[j] * (d1 - d2)) / (d1 * d2)
+            u, v = a[j] + SHIFT, b[j] + SHIFT
+            n1, d1 = TWO * u * v + C1, u * u + v * v + C1
+            n2, d2 = TWO * (r[j] - a[j] * b[j]) + C2, s[j] - a[j] * a[j] - b[j] * b[j] + C2
+            of_first = v * n2 - similarity[j] * u * d2
+            of_second = similarity[j] * a[j] * d1 - b[j] * n1
+            out[j] = TWO * (of_first + of_second) / (d1 * d2)
         out = derivatives[1, row][2 * HALF :]
         for j in range(width):
             out[j] = -TWO * similarity[j] / (s[j] - a[j] * a[j] - b[j] * b[j] + C2)
         out = derivatives[2, row][2 * HALF :]
         for j in range(width):
-            squares = a[j] * a[j] + b[j] * b[j]
-            out[j] = TWO * (TWO * a[j] * b[j] + C1) / ((squares + C1) * (s[j] - squares + C2))
+            u, v = a[j] + SHIFT, b[j] + SHIFT
+            out[j] = TWO * (TWO * u * v + C1) / ((u * u + v * v + C1) * (s[j] - a[j] * a[j] - b[j] * b[j] + C2))
         for j in range(width):
             total += similarity[j]
     return total
