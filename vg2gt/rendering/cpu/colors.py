@@ -16,6 +16,7 @@ _FAST = {"contract", "nsz"}
 _MOST = 16  # coefficients, of degree 3
 _ZERO, _HALF, _SMALLEST = np.float32(0), np.float32(0.5), np.float32(1e-12)
 _TWO, _THREE, _FOUR, _SIX, _EIGHT = np.float32(2), np.float32(3), np.float32(4), np.float32(6), np.float32(8)
+# factors of the functions in vg2gt.geometry.spherical_harmonics.basis, in their order: degree 0, 1, 2 and 3
 _C0, _C1, _C2 = np.float32(0.28209479177387814), np.float32(0.4886025119029199), np.float32(1.0925484305920792)
 _D2 = np.float32(0.31539156525252005)
 _A, _B, _E = np.float32(0.5900435899266435), np.float32(2.890611442640554), np.float32(0.4570457994644658)
@@ -106,6 +107,17 @@ def _basis_gradient(x, y, z, count, dx, dy, dz):
         dx[15], dy[15], dz[15] = -_THREE * _A * (xx - yy), _SIX * _A * x * y, _ZERO
 
 
+@kernel_part(fastmath=_FAST, error_model="numpy")
+def _color(sh, n, values):
+    """Colour of a Gaussian before it is clamped, from the values of the basis."""
+    red = green = blue = _HALF
+    for k in range(sh.shape[1]):
+        red += values[k] * sh[n, k, 0]
+        green += values[k] * sh[n, k, 1]
+        blue += values[k] * sh[n, k, 2]
+    return red, green, blue
+
+
 @kernel(fastmath=_FAST, error_model="numpy", nogil=True)
 def _colors(sh, means, centers, colors, first, last):
     count, values = sh.shape[1], np.empty(_MOST, np.float32)
@@ -113,11 +125,7 @@ def _colors(sh, means, centers, colors, first, last):
         for n in range(first, last):
             x, y, z, _ = _direction(means, centers, n, view)
             _basis(x, y, z, count, values)
-            red = green = blue = _HALF
-            for k in range(count):
-                red += values[k] * sh[n, k, 0]
-                green += values[k] * sh[n, k, 1]
-                blue += values[k] * sh[n, k, 2]
+            red, green, blue = _color(sh, n, values)
             colors[view, n, 0] = max(red, _ZERO)
             colors[view, n, 1] = max(green, _ZERO)
             colors[view, n, 2] = max(blue, _ZERO)
@@ -134,11 +142,7 @@ def _colors_backward(sh, means, centers, of_colors, of_sh, of_means, of_centers,
         for n in range(first, last):
             x, y, z, length = _direction(means, centers, n, view)
             _basis(x, y, z, count, values)
-            red = green = blue = _HALF
-            for k in range(count):
-                red += values[k] * sh[n, k, 0]
-                green += values[k] * sh[n, k, 1]
-                blue += values[k] * sh[n, k, 2]
+            red, green, blue = _color(sh, n, values)
             # no gradient where a colour was clamped
             of_red = of_colors[view, n, 0] if red >= _ZERO else _ZERO
             of_green = of_colors[view, n, 1] if green >= _ZERO else _ZERO
