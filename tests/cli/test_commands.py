@@ -16,6 +16,7 @@ from vg2gt import __version__
 from vg2gt.cli import main
 from vg2gt.cli.arguments import without_patterns
 from vg2gt.cli.commands import COMMANDS, DATA_COMMANDS, Command, dispatch
+from vg2gt.outputs.output_names import OUTPUTS
 
 Said = Callable[..., tuple[object, str]]
 
@@ -59,6 +60,14 @@ def test_help_shows_an_example_and_of_a_training_every_group_and_imports_little(
     for group in ("ablation", "backend", "data", "experiment", "logger", "loss", "model", "renderer"):
         assert f"\n{group}: " in helps["train"]
         assert f"\n{group}: " in helps["ablate"]
+    assert len(helps["reconstruct"].strip().splitlines()) <= 61  # with the line that names it
+
+
+def test_outputs_are_listed_without_images(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(sys, "argv", ["vg2gt", "reconstruct", "--save", "help"])
+    with suppress(SystemExit):
+        main()
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(OUTPUTS)
 
 
 def test_the_front_door(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

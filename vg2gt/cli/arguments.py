@@ -6,7 +6,7 @@ import argparse
 import glob
 import re
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
@@ -27,8 +27,11 @@ if TYPE_CHECKING:
 folders.register()
 
 OVERRIDE = re.compile(r"(\+\+?|~)?[A-Za-z_][\w./]*=")
-WATCH = "serve a page that shows the scene while it is refined"
-OVERRIDES = "\nmodel, backend, renderer and refinement are set by key=value: backend=da3_small refine.full.size=1008"
+MODES = ("solid", "rasterized")
+WATCH = "serve a page that shows the scene meanwhile"
+GROUPS = (
+    "hydra.help.template='$APP_CONFIG_GROUPS\n\nkey=value changes a key; --cfg job prints all keys with their values.'"
+)
 
 
 def hydra_command(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
@@ -48,6 +51,7 @@ def hydra_command(name: str) -> Callable[[Callable[[DictConfig], None]], Callabl
             """Composes the configuration with Hydra, which also reports wrong arguments, and runs the job."""
             if {"-h", "--help"} & set(sys.argv):
                 print(f"{command.does}\n\nexample: {command.example}\n")
+                sys.argv.append(GROUPS)
             with errors_in_one_line():
                 hydra.main(version_base="1.3", config_path=config_dir(), config_name=name)(job)()
 
@@ -72,25 +76,43 @@ def watching(wanted: bool) -> Iterator[LiveView | None]:
         view.close()
 
 
-def flag_parser(name: str, details: str = "") -> argparse.ArgumentParser:
+def flag_parser(name: str, details: str = "", usage: str | None = None) -> argparse.ArgumentParser:
     """Creates the parser of a command with flags; its help ends with the example and ``details``."""
     command = (COMMANDS | {f"data {each}": found for each, found in DATA_COMMANDS.items()})[name]
     return argparse.ArgumentParser(
         f"vg2gt {name}",
+        usage=usage,
         description=f"{command.does[0].upper()}{command.does[1:]}.",
         epilog=f"example: {command.example}\n{details}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
 
 
-def add_common_flags(parser: argparse.ArgumentParser, saved: Sequence[str]) -> None:
-    """Adds the flags of all commands that render; ``saved`` is the default of ``--save``."""
-    add = parser.add_argument
-    add("--save", type=list_of_names, default=list(saved), metavar="LIST", help=f"default: {','.join(saved)}")
-    add("--mode", choices=("solid", "rasterized"), default="solid", help="how views are rendered")
-    add("--device", default="auto", help="auto, cpu, cuda, cuda:N")
+def add_common_flags(add: Callable[..., Any], saved: Sequence[str], outputs: Mapping[str, str]) -> None:
+    """Adds the flags of all commands that render, by ``add_argument`` of a parser or a group.
+
+    Args:
+        add: adds a flag.
+        saved: the default of ``--save``.
+        outputs: the names that ``--save`` takes, with their descriptions.
+    """
+    names = "files to write, separated by commas; --save help lists all"
+    add("--save", type=_saved(outputs), default=list(saved), metavar="LIST", help=f"{names}; default: "
+        + ", ".join(saved))  # fmt: skip
+    add("--mode", choices=MODES, default=MODES[0], metavar="MODE", help="how to render: solid (default) or rasterized")
+    add("--device", default="auto", metavar="NAME", help="auto (default), cpu, cuda or cuda:N")
     add("--overwrite", action="store_true", help="replace existing outputs")
-    add("--quiet", action="store_true", help="no progress bars")
+    add("--quiet", action="store_true", help="show no progress bars")
+
+
+def _saved(outputs: Mapping[str, str]) -> Callable[[str], list[str]]:
+    def names(text: str) -> list[str]:
+        if text == "help":
+            print("\n".join(f"{name:<13} {does}" for name, does in outputs.items()))
+            sys.exit()
+        return list_of_names(text)
+
+    return names
 
 
 def separate(argv: Sequence[str] | None) -> tuple[list[str], list[str]]:
@@ -113,8 +135,3 @@ def without_patterns(paths: Sequence[str]) -> list[str]:
 def list_of_names(text: str) -> list[str]:
     """Splits ``a,b,c``."""
     return [name.strip() for name in text.split(",") if name.strip()]
-
-
-def listing(outputs: dict[str, Any]) -> str:
-    """Lists the outputs that ``--save`` accepts, one per line."""
-    return "\n".join(["", "outputs of --save:", *(f"  {name:<13} {text}" for name, text in outputs.items())])

@@ -11,12 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vg2gt.cli.arguments import (
-    OVERRIDES,
     WATCH,
     add_common_flags,
     flag_parser,
     list_of_names,
-    listing,
     separate,
     watching,
     without_patterns,
@@ -25,27 +23,10 @@ from vg2gt.cli.errors import errors_in_one_line
 from vg2gt.outputs.output_names import DEFAULT, LARGE, OUTPUTS, PREDICTED, TILES
 from vg2gt.reconstruction.windows import WINDOWS
 
-POSES = (
-    "cameras from files next to the images, or from structure from motion (kept in DIR/sfm); auto: the first of these "
-    "that is available, if the backbone needs any"
-)
-
-WINDOW = (
-    "process N images and their neighbours at a time, which limits the memory; 0: all at once; default: 24 for more "
-    "than 100 images (kept in DIR/windows until the end, so that an interrupted command can resume)"
-)
-
-QUALITY = (
-    "how long to refine photographs: draft stays at the working size, normal and high continue at the photographs' own "
-    "size, high in five times as many steps"
-)
-
-EACH = (
-    "images are captures (folders, videos, or a .txt file that lists them), each for a scene in DIR/NAME; what is done "
-    "is kept. hydra/launcher=NAME runs them elsewhere"
-)
-
-REFINE = "refine for N steps at the working size only, recordings too; 0: feed-forward"
+USAGE = "vg2gt reconstruct IMAGES... --out DIR [options] [KEY=VALUE ...]"
+DETAILS = """
+KEY=VALUE sets model, backend, renderer and refinement: backend=da3_small,
+model.fine.max_voxels=500000, refine.full.size=1008"""
 
 if TYPE_CHECKING:
     from vg2gt.api import Pipeline
@@ -55,27 +36,7 @@ if TYPE_CHECKING:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Runs the command; errors are reported in one line."""
-    arguments = flag_parser("reconstruct", OVERRIDES + listing(OUTPUTS))
-    add = arguments.add_argument
-    add("images", nargs="+", help="image files, a folder of them, a video, or a recording with known cameras")
-    add("--out", metavar="DIR", required=True, help="where to write")
-    add("--each", action="store_true", help=EACH)
-    add("--ckpt", metavar="PATH", help="a checkpoint or a run's folder; default: the shipped weights for "
-        "backend=sweep, an untrained head for others")  # fmt: skip
-    add("--poses", choices=("auto", "given", "sfm"), default="auto", help=POSES)
-    add("--size", type=_size, metavar="N|HxW", help="longer side, or height x width, in pixels; default 518, CPU 280")
-    add("--max-images", type=int, metavar="N", help="use at most N, evenly spaced; default: all, 32 of a video")
-    add("--window", type=int, metavar="N", help=WINDOW)
-    add("--quality", choices=("draft", "normal", "high"), default="normal", help=QUALITY)
-    add("--refine", type=int, metavar="N", help=REFINE)
-    add("--mesh-voxel", type=float, metavar="X", help="edge of the mesh's voxels in scene units")
-    add("--calibration", metavar="FILE", help="calibration file of the error bounds; default: next to the checkpoint")
-    add("--min-confidence", type=float, metavar="C", help="drop Gaussians whose depth error bound exceeds 1 - C")
-    add("--drop", type=list_of_names, default=[], metavar="LIST", help="drop Gaussians by status, a list of: guessed, "
-        "contradicted, single (seen by one view), unseen")  # fmt: skip
-    add("--watch", action="store_true", help=WATCH)
-    add("--object", action="store_true", help="keep only the object that the cameras look at, without surroundings")
-    add_common_flags(arguments, DEFAULT)
+    arguments = _parser()
     given, overrides = separate(argv)
     options = arguments.parse_args(given)
     options.images = without_patterns(options.images)
@@ -87,6 +48,42 @@ def main(argv: Sequence[str] | None = None) -> None:
             reconstruct_each(options, overrides, run)
         else:
             run(options, overrides)
+
+
+def _parser() -> argparse.ArgumentParser:
+    """Returns the parser of the options, which its help groups by what they are about."""
+    parser = flag_parser("reconstruct", DETAILS, USAGE)
+    parser.add_argument("images", nargs="+", metavar="IMAGES", help="image files, a folder of them, a video, or a "
+        "recording with known cameras")  # fmt: skip
+    add = parser.add_argument_group("input").add_argument
+    add("--size", type=_size, metavar="N|HxW", help="longer side, or height and width, in pixels at which the model "
+        "works; default: 518, on a CPU 280")  # fmt: skip
+    add("--max-images", type=int, metavar="N", help="use at most N, evenly spaced; default: all, 32 of a video")
+    add("--poses", choices=("auto", "given", "sfm"), default="auto", metavar="SOURCE", help="cameras: given (files "
+        "next to the images), sfm (structure from motion) or auto (default: given if there are any)")  # fmt: skip
+    add("--window", type=int, metavar="N", help="process N images at a time, which limits the memory; 0: all at once; "
+        "default: 24 for more than 100 images")  # fmt: skip
+    add("--each", action="store_true", help="IMAGES are captures (folders, videos or a .txt file that lists them); "
+        "each makes a scene in DIR/NAME")  # fmt: skip
+    add = parser.add_argument_group("model").add_argument
+    add("--ckpt", metavar="PATH", help="a checkpoint or a run's folder; default: the weights in the package for "
+        "backend=sweep, an untrained head for others")  # fmt: skip
+    add("--calibration", metavar="FILE", help="calibration of the stated errors; default: next to the checkpoint")
+    add = parser.add_argument_group("refinement of up to 100 photographs, on by default").add_argument
+    add("--quality", choices=("draft", "normal", "high"), default="normal", metavar="NAME", help="draft (working size "
+        "only), normal (default: then at the photographs' own size) or high (with five times the steps)")  # fmt: skip
+    add("--refine", type=int, metavar="N", help="refine any scene for N steps at the working size only; 0: not at all")
+    add("--watch", action="store_true", help=WATCH)
+    add = parser.add_argument_group("what to keep").add_argument
+    add("--object", action="store_true", help="only the object that the cameras look at")
+    add("--min-confidence", type=float, metavar="C", help="only Gaussians with a depth error bound up to 1 - C")
+    add("--drop", type=list_of_names, default=[], metavar="LIST", help="no Gaussians with these statuses: guessed, "
+        "contradicted, single (seen by one view), unseen")  # fmt: skip
+    add = parser.add_argument_group("output").add_argument
+    add("--out", metavar="DIR", required=True, help="where to write")
+    add_common_flags(add, DEFAULT, OUTPUTS)
+    add("--mesh-voxel", type=float, metavar="X", help="edge of the mesh's voxels in scene units")
+    return parser
 
 
 def run(options: argparse.Namespace, overrides: Sequence[str]) -> Scene:

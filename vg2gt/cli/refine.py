@@ -7,17 +7,19 @@ import logging
 from collections.abc import Sequence
 from pathlib import Path
 
-from vg2gt.cli.arguments import WATCH, add_common_flags, flag_parser, listing, separate, watching
+from vg2gt.cli.arguments import WATCH, add_common_flags, flag_parser, separate, watching
 from vg2gt.cli.errors import errors_in_one_line
 from vg2gt.outputs.output_names import DEFAULT, OUTPUTS
 
-HOW = "\nrefine=NAME (see configs/refine) and refine.key=value set the options; default: depends on the scene's cameras"
+HOW = """
+refine=NAME selects a file of configs/refine, refine.KEY=VALUE changes a key.
+Default: photographs, or default for RGB-D recordings."""
 ADVICE = "fewer or smaller images (vg2gt reconstruct --max-images, --size) or fewer Gaussians"
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Runs the command; errors are reported in one line."""
-    arguments = flag_parser("refine", HOW + listing(OUTPUTS))
+    arguments = flag_parser("refine", HOW)
     add = arguments.add_argument
     add("scene", metavar="DIR", help="a folder that vg2gt reconstruct has written")
     add("--out", metavar="DIR", help="where to write; default: refined/ in the scene's folder")
@@ -25,7 +27,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     add("--seconds", type=float, metavar="S", help="stop after S seconds, or after --steps if that comes first")
     add("--holdout", type=int, metavar="N", help="exclude every N-th view and print its PSNR before and after")
     add("--watch", action="store_true", help=WATCH)
-    add_common_flags(arguments, DEFAULT)
+    add_common_flags(add, DEFAULT, OUTPUTS)
     given, overrides = separate(argv)
     options = arguments.parse_args(given)
     logging.basicConfig(level=logging.WARNING, format="%(message)s")

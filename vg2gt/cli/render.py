@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vg2gt.cli.arguments import add_common_flags, flag_parser, listing
+from vg2gt.cli.arguments import add_common_flags, flag_parser
 from vg2gt.cli.errors import errors_in_one_line
 from vg2gt.outputs.output_names import FPS, MAPS
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Runs the command; errors are reported in one line."""
-    arguments = flag_parser("render", listing(OUTPUTS))
+    arguments = flag_parser("render")
     add = arguments.add_argument
     add("scene", help="a scene's folder, scene.ply, .spz, .glb or .gltf")
     motion = arguments.add_mutually_exclusive_group().add_argument
@@ -56,7 +56,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         help=f"frames per second; default: those of camera_path.json, else {FPS:g}",
     )
     add("--near", type=float, help="near plane in scene units; default: that of report.json next to it, else 0.01")
-    add_common_flags(arguments, DEFAULT)
+    add_common_flags(add, DEFAULT, OUTPUTS)
     arguments.set_defaults(save=None)
     options = arguments.parse_args(argv)
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
