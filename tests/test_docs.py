@@ -186,6 +186,11 @@ def test_advice_names_options_that_exist() -> None:
     assert set(flags) <= set(re.findall(r"--[a-z-]+", help_of("reconstruct")))
 
 
+def test_the_site_lists_every_page() -> None:
+    listed = re.findall(r": ([\w/-]+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE)
+    assert {ROOT / "docs" / page for page in listed} == set(DOCS)
+
+
 def test_the_site_builds(tmp_path: Path) -> None:
     pytest.importorskip("material", reason='needs pip install -e ".[docs]"')
     from mkdocs.commands.build import build  # pyright: ignore[reportMissingImports]
