@@ -23,8 +23,9 @@ EVALUATION = (
 )
 RECONSTRUCTION = (
     "fewer images (--max-images), smaller ones (--size), fewer voxels (model.fine.max_voxels=500000), "
-    "fewer Gaussians (model.gaussians.max_gaussians=1000000), smaller chunks (backend.head_chunk=2, "
-    "+model.fine.dense_head.views_per_chunk=2), or refine smaller photographs (refine.full.size=800, --quality draft)"
+    "fewer Gaussians (model.gaussians.max_gaussians=1000000), smaller chunks "
+    "(+model.fine.dense_head.views_per_chunk=2, of VGGT and DA3 also backend.head_chunk=2), or refine smaller "
+    "photographs (refine.full.size=800, --quality draft)"
 )
 
 # Parts of out-of-memory messages of torch's allocators and of CUDA that have no exception class of their own.
