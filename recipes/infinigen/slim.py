@@ -1,6 +1,6 @@
 """Slim copies of rooms, small enough for the repository: ``python -m recipes.infinigen.slim FOLDER OUT``.
 
-Writes one file of at most 24 views for every room in ``FOLDER`` that has none in ``OUT``, with the room's seed, kind
+Writes one file of at most 48 views for every room in ``FOLDER`` that has none in ``OUT``, with the room's seed, kind
 and figures. :func:`read_slim` reads such a file.
 """
 
@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from vg2gt.io.files import write_bytes
 from vg2gt.io.images import encode_image, open_image
 
-VIEWS = 24
+VIEWS = 48
 QUALITY = 90  # of the JPEG
 LEAST, STEP = 0.02, math.log(5000) / 4000  # depth in metres of value 1, and log-depth between values (0.2 %); 0 is sky
-_SHARES = {"walk": 7, "orbit_near": 5, "orbit_far": 5, "near": 3, "far": 4}  # views of each kind of path, in order
+_SHARES = {"walk": 12, "orbit_near": 12, "orbit_far": 12, "near": 6, "far": 6}  # views of each kind of path, in order
 
 
 def choose(paths: list[str]) -> list[int]:
