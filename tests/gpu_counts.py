@@ -33,6 +33,7 @@ PACKAGE = "vg2gt"
 KERNELS = {
     **dict.fromkeys(("empty", "empty_like", "empty_strided", "new_empty", "new_empty_strided"), 0),
     **dict.fromkeys(("_unsafe_view", "promote_types", "_local_scalar_dense"), 0),
+    **dict.fromkeys(("_record_function_enter_new", "_record_function_exit"), 0),
     **dict.fromkeys(("constant_pad_nd", "slice_backward", "select_backward"), 2),
 }
 TENSORS = 30  # that a multi-tensor kernel takes at least
@@ -125,7 +126,7 @@ class Operations(TorchDispatchMode):
 def as_on_a_gpu() -> Iterator[None]:
     """Makes a CPU run the code paths of a GPU inside the block, except Triton kernels."""
     from vg2gt.kernels import knn
-    from vg2gt.losses import gaussian, geometry
+    from vg2gt.losses import gaussian, geometry, strided
     from vg2gt.method import fine, sparse_conv
     from vg2gt.method.additions import voxel_normals
 
@@ -134,6 +135,7 @@ def as_on_a_gpu() -> Iterator[None]:
     ]
     changes += [
         (sparse_conv, "one_by_one", lambda device: False),
+        (strided, "by_slices", lambda device: False),
         (geometry, "point_normal_loss", geometry.point_normal_reference),
         (geometry, "order_statistic", geometry.sorted_order_statistic),
         (gaussian, "structure_loss", gaussian.structure_reference),

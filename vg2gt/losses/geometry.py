@@ -15,6 +15,7 @@ from torch import Tensor
 from vg2gt.geometry.cameras import invert_rigid
 from vg2gt.geometry.normals import ray_slopes
 from vg2gt.kernels.point_normals import PointNormals
+from vg2gt.losses.strided import Neighbors, neighbor_pairs, pixel_squares
 from vg2gt.losses.truth import Truth
 from vg2gt.types import Cameras
 
@@ -142,13 +143,12 @@ def depth_gradient_loss(error: Tensor, valid: Tensor) -> Tensor:
         error: ``[..., V, H, W]``.
         valid: ``[V, H, W]`` bool with any of the leading axes.
     """
-    total = error.new_zeros(())
-    for stride in DEPTH_STRIDES:
-        e, m = error[..., ::stride, ::stride], valid[..., ::stride, ::stride]
-        across = e.diff(dim=-1).abs().clamp(max=MAX_ERROR) * (m[..., 1:] & m[..., :-1])
-        down = e.diff(dim=-2).abs().clamp(max=MAX_ERROR) * (m[..., 1:, :] & m[..., :-1, :])
-        total = total + (across.sum(MAPS) + down.sum(MAPS)) / m.sum(MAPS).clamp(min=1)
-    return total / len(DEPTH_STRIDES)
+    pairs = neighbor_pairs((error.shape[-2], error.shape[-1]), DEPTH_STRIDES, error.device)
+    first, second = pairs.read(error).unbind(-2)  # [..., V, N]
+    known, also = pairs.read(valid).unbind(-2)
+    differences = ((second - first).abs().clamp(max=MAX_ERROR) * (known & also)).sum(-2)
+    counts = [valid[..., ::stride, ::stride].sum(MAPS) for stride in DEPTH_STRIDES]
+    return (pairs.sums(differences) / torch.stack(counts, -1).clamp(min=1)).mean(-1)
 
 
 def point_errors(depth: Tensor, cameras: Cameras, truth: Truth) -> Tensor:
@@ -195,45 +195,34 @@ def point_normal_loss(depth: Tensor, cameras: Cameras, truth: Truth, valid: Tens
 
 def point_normal_reference(depth: Tensor, cameras: Cameras, truth: Truth, valid: Tensor) -> Tensor:
     """:func:`point_normal_loss` in plain torch, for any device; also differentiable in the cameras."""
-    turn = _turn(cameras, truth)[..., None, None, :, :]
-    slopes, true_slopes = (ray_slopes(own.intrinsics, own.size) for own in (cameras, truth.cameras))
-    total = depth.new_zeros(())
-    for stride in POINT_STRIDES:
-        predicted = _corner_normals(depth, cameras.intrinsics, slopes, stride)
-        true = _corner_normals(truth.depth, truth.cameras.intrinsics, true_slopes, stride)
-        true = (turn @ true.flatten(-2)).view_as(predicted)
-        lengths = (predicted.square().sum(-3) * true.square().sum(-3)).sqrt()
-        cosine = (predicted * true).sum(-3) / lengths  # [..., B, V, 2, 2, h - 1, w - 1]
-        mask = valid[..., ::stride, ::stride]
-        across, down = mask[..., 1:] & mask[..., :-1], mask[..., 1:, :] & mask[..., :-1, :]
-        both = _at_corners(across, -2)[..., None, :, :, :] & _at_corners(down, -1)[..., None, :, :]
-        corners = (-5, -4, *MAPS)
-        total = total + ((1 - cosine) * both).sum(corners) / both.sum(corners).clamp(min=1)
-    return total / len(POINT_STRIDES)
+    squares = pixel_squares(cameras.size, POINT_STRIDES, depth.device)
+    predicted = _corner_normals(depth, cameras, squares)  # [..., B, V, 3, 2, 2, N]
+    true = _corner_normals(truth.depth, truth.cameras, squares)
+    true = (_turn(cameras, truth) @ true.flatten(-3)).view_as(predicted)
+    lengths = (predicted.square().sum(-4) * true.square().sum(-4)).sqrt()
+    cosine = (predicted * true).sum(-4) / lengths  # [..., B, V, 2, 2, N]
+    mask = squares.read(valid).unflatten(-2, (2, 2))
+    both = mask.all(-2)[..., None, :] & mask.all(-3)[..., None, :, :]
+    corners = (-4, -3, -2)
+    sums = squares.sums(((1 - cosine) * both).sum(corners)) / squares.sums(both.sum(corners)).clamp(min=1)
+    return sums.mean(-1)
 
 
-def _at_corners(between: Tensor, dim: int) -> Tensor:
-    """Stacks the values at positions i and i + 1 along ``dim`` of ``[..., h, w]``: ``[..., 2, h, w]``."""
-    count = between.shape[dim] - 1
-    return torch.stack((between.narrow(dim, 0, count), between.narrow(dim, 1, count)), -3)
+def _corner_normals(depth: Tensor, cameras: Cameras, squares: Neighbors) -> Tensor:
+    """Returns camera-frame normals ``[..., 3, 2, 2, N]`` at the corners of squares of depth.
 
-
-def _corner_normals(depth: Tensor, intrinsics: Tensor, slopes: tuple[Tensor, Tensor], stride: int) -> Tensor:
-    """Returns camera-frame normals ``[..., 2, 2, 3, h - 1, w - 1]`` at the corners of 2x2 squares of strided depth.
-
-    The axes of length two select the corner whose neighbours are to the right or left, and below or above. Computed as
-    in :mod:`vg2gt.geometry.normals`, with ``gx = fx (d1 - d) / d1``; not of unit length.
+    The axes of length two select the upper or lower corner, and the left or right one. Computed as in
+    :mod:`vg2gt.geometry.normals`, with ``gx = fx (d1 - d) / d1``; not of unit length.
     """
-    u, v = slopes[0][..., ::stride], slopes[1][..., ::stride, :]
-    depth = depth[..., ::stride, ::stride]
-    fx, fy = (intrinsics[..., i, i, None, None] / stride for i in range(2))
-    columns = torch.stack((depth[..., 1:], depth[..., :-1]), -3)
-    rows = torch.stack((depth[..., 1:, :], depth[..., :-1, :]), -3)
-    x = (fx * depth.diff(dim=-1))[..., None, :, :] / columns  # [..., 2, h, w - 1]
-    y = (fy * depth.diff(dim=-2))[..., None, :, :] / rows  # [..., 2, h - 1, w]
-    x, y = _at_corners(x, -2), torch.stack((y[..., :-1], y[..., 1:]), -4)
-    z = -1 - _at_corners(u, -1)[..., None, :, :] * x - _at_corners(v, -2)[..., None, :, :, :] * y
-    return torch.stack((x, y, z), -3)
+    depth = squares.read(depth).unflatten(-2, (2, 2))
+    (left, right), (upper, lower) = depth.unbind(-2), depth.unbind(-3)  # [..., 2, N] each
+    fx, fy = (cameras.intrinsics[..., i, i, None, None] / squares.stride for i in range(2))
+    x = (fx * (right - left))[..., None, :] / depth.flip(-2)
+    y = (fy * (lower - upper))[..., None, :, :] / depth.flip(-3)
+    slopes = (part.expand(*part.shape[:-2], *cameras.size) for part in ray_slopes(cameras.intrinsics, cameras.size))
+    u, v = (squares.read(part).unflatten(-2, (2, 2)) for part in slopes)
+    z = -1 - u * x - v * y
+    return torch.stack((x, y, z), -4)
 
 
 def _turn(cameras: Cameras, truth: Truth) -> Tensor:
