@@ -3,6 +3,7 @@ import torch
 
 from tests.references import draw_weights, read_cases, read_json
 from vg2gt.method import PTv3
+from vg2gt.method.ptv3 import _Residual
 
 SIZE = torch.full((2,), 0.125)
 
@@ -33,6 +34,17 @@ def test_batch_norm_of_one_voxel_uses_the_running_statistics(voxels, make_ptv3):
     features, grid, batch, size = voxels
     one = (features[:1], grid[:1], batch[:1], size)
     assert net(*one).isfinite().all()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_a_residual_in_one_operation_equals_the_plain_one(dtype):
+    features, probe = torch.randn(2, 50, 8)
+    change, kept = torch.randn(50, 8).to(dtype), torch.empty(50, 1).bernoulli_(0.7) / 0.7
+    found, expected = ([x.clone().requires_grad_() for x in (features, change)] for _ in range(2))
+    out, plain = _Residual.apply(*found, kept), expected[0] + expected[1] * kept
+    torch.testing.assert_close(out, plain)
+    of_found, of_expected = torch.autograd.grad(out, found, probe), torch.autograd.grad(plain, expected, probe)
+    assert all(torch.equal(one, other) for one, other in zip(of_found, of_expected, strict=True))
 
 
 def test_drop_path_acts_in_training_only(voxels, make_ptv3):

@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -154,6 +154,24 @@ class MLP(nn.Module):
         return self.fc2(F.gelu(self.fc1(x)))
 
 
+class _Residual(torch.autograd.Function):
+    """``features + change * kept`` in one operation, forward and backward, whatever the dtypes."""
+
+    @staticmethod
+    def forward(ctx: Any, features: Tensor, change: Tensor, kept: Tensor) -> Tensor:
+        """Returns ``[M, C]`` for ``kept [M, 1]``, which has no gradient."""
+        ctx.save_for_backward(kept)
+        ctx.dtype = change.dtype
+        return torch.addcmul(features, change, kept, out=torch.empty_like(features))  # autocast would copy the change
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, Tensor, None]:  # pyright: ignore
+        """Returns the gradients of the features and the change."""
+        (kept,) = ctx.saved_tensors
+        of_change = torch.empty_like(grad_outputs[0], dtype=ctx.dtype)
+        return grad_outputs[0], torch.mul(grad_outputs[0], kept, out=of_change), None
+
+
 class _PTv3Block(nn.Module):
     """Conditional positional encoding by sparse convolution (xCPE), attention and MLP, each residual.
 
@@ -188,8 +206,8 @@ class _PTv3Block(nn.Module):
             return features + self.mlp[0](self.norm2[0](features))
         share = 1 - self.drop_path  # of the voxels that keep a branch, which is scaled to the same mean
         kept = torch.empty(2, len(features), 1, device=features.device).bernoulli_(share) / share
-        features = features + attended * kept[0]
-        return features + self.mlp[0](self.norm2[0](features)) * kept[1]
+        features = _Residual.apply(features, attended, kept[0])  # pyright: ignore
+        return _Residual.apply(features, self.mlp[0](self.norm2[0](features)), kept[1])  # pyright: ignore
 
 
 class _GridPool(nn.Module):
@@ -340,7 +358,9 @@ class PTv3(nn.Module):
         levels = _make_levels(local, batch, len(voxel_size), keys, extent, [[*sizes] for sizes in kernels], generator)
         # stem: [M, in_channels] to [M, enc_channels[0]]
         stem, level = self.embedding["stem"], levels[0]
-        features = F.gelu(stem["norm"](stem["conv"](features, level.pairs[self.stem_kernel])))  # pyright: ignore
+        features = stem["conv"](features, level.pairs[self.stem_kernel])  # pyright: ignore
+        features = features.to(torch.promote_types(features.dtype, torch.float32))
+        features = F.gelu(stem["norm"](features))  # pyright: ignore
         # encoder: pool from level to level and keep the skip connections
         skips = []
         for stage, level in zip(self.enc.values(), levels, strict=True):

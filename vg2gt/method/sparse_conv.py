@@ -43,8 +43,9 @@ class NeighborTable:
     Attributes:
         sources: ``[T, P + 1]`` rows of the neighbours, padded with M; the last column is always padding.
         targets: ``[T, P + 1]`` rows of the voxels that have these neighbours, padded with M.
-        slots: ``[M, T]`` index of a voxel's neighbour in ``sources.flatten()``; without one, the last of its row.
-        back: ``[M, T]`` index in ``targets.flatten()`` of the voxel whose neighbour a voxel is; likewise.
+        slots: ``[M, T + 1]`` index of a voxel's neighbour in ``sources.flatten()``; without one, the last of its row.
+            The last column is that of the voxels themselves, which follow the neighbours.
+        back: ``[M, T + 1]`` index in ``targets.flatten()`` of the voxel whose neighbour a voxel is; likewise.
         bags: ``[M]`` first index of each voxel in ``slots.flatten()``.
     """
 
@@ -60,12 +61,34 @@ class NeighborTable:
         some = max(1, HELD // (rows * width))
         return (slice(begin, min(begin + some, offsets)) for begin in range(0, offsets, some))
 
-    def sums(self, products: Tensor, slots: Tensor, some: slice) -> Tensor:
-        """Returns each voxel's sum ``[M, C]`` of the products ``[t, P + 1, C]`` at its ``slots`` or ``back``."""
-        rows = products.flatten(0, 1)
-        if len(products) == slots.shape[1]:
-            return F.embedding_bag(slots.flatten(), rows, self.bags, mode="sum")
-        return F.embedding_bag(slots[:, some] - some.start * self.sources.shape[1], rows, mode="sum")
+    def sums(self, rows: Tensor, slots: Tensor, taps: Tensor, center: Tensor, bias: Tensor | None = None) -> Tensor:
+        """Returns each voxel's sum ``[M, out]`` of products.
+
+        Args:
+            rows: ``[M + 1, in]``, the last of zeros.
+            slots: ``slots`` to multiply the neighbours, ``back`` the voxels whose neighbour one is.
+            taps: ``[T, in, out]`` matrices of the offsets.
+            center: ``[in, out]`` matrix of the voxel itself.
+            bias: ``[out]``.
+        """
+        which = self.sources if slots is self.slots else self.targets
+        out: Tensor | None = None
+        for some in self.parts(taps.shape[1] + taps.shape[2]):
+            last = some.stop == len(taps)
+            found, factors = rows[which[some]], taps[some]
+            count = found.shape[0] * found.shape[1]
+            products = found.new_empty(count + last * (len(rows) - 1), taps.shape[2])
+            torch.bmm(found, factors, out=products[:count].view(*found.shape[:2], -1))
+            if last:
+                own, out_own = (rows[:-1], center), products[count:]
+                torch.mm(*own, out=out_own) if bias is None else torch.addmm(bias, *own, out=out_own)
+            bags = slots[:, some.start : some.stop + last]
+            if bags.shape == slots.shape:
+                return F.embedding_bag(slots.flatten(), products, self.bags, mode="sum")
+            part = F.embedding_bag(bags - some.start * which.shape[1], products, mode="sum")
+            out = part.to(torch.promote_types(part.dtype, torch.float32)) if out is None else out + part
+        assert out is not None
+        return out.to(rows.dtype)
 
 
 def neighbors(cells: Sequence[Cells]) -> list[Pairs] | list[NeighborTable]:
@@ -135,7 +158,9 @@ def _tabulate(rows: Tensor, ranks: Tensor, most: int) -> NeighborTable:
     # a last column for voxels that are nobody's neighbour; whose neighbour a voxel is, the opposite offset tells
     slots = F.pad(column, (0, 1), value=most) + (most + 1) * torch.arange(offsets, device=rows.device)[:, None]
     back = slots.gather(1, rows.flip(0))
-    return NeighborTable(sources, targets, *(x.t().contiguous() for x in (slots[:, :-1], back)), bags=voxels * offsets)
+    itself = voxels[None] + offsets * (most + 1)
+    both = (torch.cat((part, itself)).t().contiguous() for part in (slots[:, :-1], back))
+    return NeighborTable(sources, targets, *both, bags=voxels * (offsets + 1))
 
 
 def neighbor_pairs(grid: Tensor, batch: Tensor, kernel_size: int, spans: Sequence[int] | None = None) -> Pairs:
@@ -186,34 +211,27 @@ class _BatchedConvolution(torch.autograd.Function):
     def forward(ctx: Any, features: Tensor, weight: Tensor, bias: Tensor | None, table: NeighborTable) -> Tensor:
         """Returns ``[M, out]`` for ``features [M, in]``, ``weight [out, k, k, k, in]`` and ``bias [out]``.
 
-        Products have the dtype of the weight, sums that of the features.
+        The result has the dtype of the weight.
         """
-        taps, center = _taps(weight)
         padded = _padded(features, weight.dtype)
-        product = padded[:-1] @ center
-        out = product.to(features.dtype) if bias is None else product + bias
-        for some in table.parts(taps.shape[1] + taps.shape[2]):
-            out += table.sums(padded[table.sources[some]] @ taps[some], table.slots, some)
         ctx.save_for_backward(padded, weight)
         ctx.table, ctx.dtype = table, features.dtype
-        return out
+        return table.sums(padded, table.slots, *_taps(weight), bias)
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore
         """Returns the gradients of the features, the weight and the bias."""
         padded, weight = ctx.saved_tensors
         table: NeighborTable = ctx.table
-        padded_grad = _padded(grad_outputs[0], padded.dtype)
-        features, grad = padded[:-1], padded_grad[:-1]
+        grad = _padded(grad_outputs[0], padded.dtype)
         taps, center = _taps(weight)
-        grad_features, of_taps = (grad @ center.t()).to(ctx.dtype), []
-        for some in table.parts(grad.shape[1] + features.shape[1]):
-            rows, grad_rows = padded[table.sources[some]], padded_grad[table.targets[some]]  # [t, P + 1, in or out]
-            of_taps += (rows.mT @ grad_rows).unbind()
-            grad_features += table.sums(grad_rows @ taps[some].mT, table.back, some)
-        of_taps.insert(len(of_taps) // 2, features.t() @ grad)
-        of_weight = torch.stack(of_taps).permute(2, 0, 1).reshape(weight.shape)  # from [k^3, in, out]
-        return grad_features, of_weight, grad_outputs[0].sum(0) if ctx.needs_input_grad[2] else None, None
+        of_taps: list[Tensor] = []  # [out, in] each
+        for some in table.parts(taps.shape[1] + taps.shape[2]):
+            of_taps += (grad[table.targets[some]].mT @ padded[table.sources[some]]).unbind()
+        of_taps.insert(len(of_taps) // 2, grad[:-1].t() @ padded[:-1])
+        of_features = table.sums(grad, table.back, taps.mT, center.t()).to(ctx.dtype)
+        of_bias = grad_outputs[0].sum(0) if ctx.needs_input_grad[2] else None
+        return of_features, torch.stack(of_taps, 1).view(weight.shape), of_bias, None
 
 
 def _taps(weight: Tensor) -> tuple[Tensor, Tensor]:
@@ -293,13 +311,13 @@ class SubmanifoldConv3d(nn.Module):
             pairs: result of :func:`neighbors` for this kernel size.
 
         Returns:
-            ``[M, out]``. Under autocast, products have its dtype and sums are float32.
+            ``[M, out]``. Under autocast, products and the result have its dtype; they are summed in float32.
         """
-        weight = self.weight
+        weight, bias = self.weight, self.bias
         if torch.is_autocast_enabled(features.device.type):
             weight = weight.to(autocast_dtype(features))
+            bias = None if bias is None else bias.to(weight.dtype)
         if isinstance(pairs, NeighborTable):
-            features = features.to(torch.promote_types(features.dtype, torch.float32))
-            return _BatchedConvolution.apply(features, weight, self.bias, pairs)  # pyright: ignore
+            return _BatchedConvolution.apply(features, weight, bias, pairs)  # pyright: ignore
         out: Tensor = _SubmanifoldConvolution.apply(features.to(weight.dtype), weight, pairs)  # pyright: ignore
-        return out if self.bias is None else out + self.bias
+        return (out if bias is None else out + bias).to(weight.dtype)

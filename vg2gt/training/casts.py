@@ -14,7 +14,7 @@ from vg2gt.method.sparse_conv import SubmanifoldConv3d
 
 CONTAINERS = (nn.Sequential, nn.ModuleList, nn.ModuleDict)
 _BOTH = ("weight", "bias")
-CAST = {nn.Linear: _BOTH, nn.Conv2d: _BOTH, nn.ConvTranspose2d: _BOTH, SubmanifoldConv3d: ("weight",)}
+CAST = {nn.Linear: _BOTH, nn.Conv2d: _BOTH, nn.ConvTranspose2d: _BOTH, SubmanifoldConv3d: _BOTH}
 """What autocast casts, for exactly these types: subclasses, such as
 :class:`vg2gt.geometry.precision.Float32Linear`, keep their weights."""
 
@@ -34,7 +34,7 @@ class WeightCasts:
         self.parts: dict[str, list[tuple[nn.Module, str]]] = {}
         for name, module in _layers(model):
             for key in CAST[type(module)]:
-                if (weight := module._parameters[key]) is not None and weight.requires_grad:
+                if (weight := module._parameters.get(key)) is not None and weight.requires_grad:
                     self.parts.setdefault(".".join(name.split(".")[:2]), []).append((module, key))
 
     @contextmanager
