@@ -106,6 +106,16 @@ class Backend(nn.Module, ABC):
         """Returns the raw cameras of ``decode(encode(images, hints))``, bit-equal; may skip all other work."""
         return self.decode_cameras(self.encode(images, hints))
 
+    def compile_blocks(self) -> None:
+        """Compiles the transformer blocks, for ``training.compile_blocks``.
+
+        Raises:
+            ValueError: if the network has none.
+        """
+        raise ValueError(
+            f"training.compile_blocks=true: backend {self.name} has no transformer blocks of ours; use vggt_1b or da3_*"
+        )
+
     def freeze(self) -> None:
         """Disables gradients of all parameters, unless not ``frozen``, and sets eval mode."""
         self.requires_grad_(not self.frozen)

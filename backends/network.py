@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from backends.base import Backend
 from backends.positions import size_tensor
+from backends.vit import ViTBlock
 from backends.weights import Weights
 from vg2gt.geometry.precision import autocast_dtype, half_precision_on_gpu
 from vg2gt.geometry.rotations import matrix_to_quat, quat_to_matrix
@@ -105,6 +106,12 @@ class NetworkBackend(Backend):
         super().freeze()
         if not self.frozen:
             self.network.get_submodule(self.camera_name).requires_grad_(False)
+
+    def compile_blocks(self) -> None:
+        """See :meth:`Backend.compile_blocks`; blocks of equal structure share their code, and sizes are free."""
+        for block in self.network.get_submodule(self.encoder_name).modules():
+            if isinstance(block, ViTBlock):
+                block.compile(dynamic=True)
 
     def encode(self, images: Tensor, hints: Hints | None = None) -> Tokens:
         """See :meth:`Backend.encode`; ``hints.cameras`` are required and used if the network takes given poses."""

@@ -1,8 +1,8 @@
 """Measurements on a GPU, in about eight minutes: ``python benchmarks/gpu.py [--parts NAME ...]``.
 
 Parts: forward and backward pass of the renderer (``render``), training steps of ``experiment=paper`` with random
-weights, by stage, and the device hours of a training of the paper's length (``step``), trainings on the same scenes
-with one GPU and all (``ddp``), ``reconstruct`` with 50 images (``reconstruct``), and ``pytest -m gpu`` (``tests``).
+weights, by stage, with plain and compiled transformer blocks, and the device hours of a training of the paper's length
+(``step``), trainings on the same scenes with one GPU and all (``ddp``), ``reconstruct`` with 50 images (``reconstruct``), and ``pytest -m gpu`` (``tests``).
 After every measurement it writes ``<date>-gpu-<part>.json`` to ``--out`` (default: the variable OUT, or
 benchmarks/results), so that partial results are kept. ``--small`` makes all sizes tiny, also for a CPU.
 """
@@ -37,6 +37,7 @@ ROOT = Path(__file__).resolve().parents[1]
 Result = dict[str, Any]
 LINES = 25  # lines of output and profile to keep
 PAPER_STEPS, PAPER_DEVICES = 420_000, 2
+COMPILED = "training.compile_blocks=true"
 DDP_STEPS = (10, 30)  # lengths of two trainings, whose difference is without start and evaluations
 
 
@@ -78,14 +79,17 @@ def step(setting: Setting) -> Iterator[Result]:
     """Training steps of the paper's experiment: time, memory, stages and profile."""
     if setting.small:
         tiny = ("backend=da3_tiny", "model=tiny", "trainer.precision=bf16-mixed")
-        cases = {"tiny": (2, (28, 56), tiny)}
+        cases = {"tiny": (2, (28, 56), tiny), "tiny, compiled blocks": (2, (28, 56), (*tiny, COMPILED))}
     else:
         # measure even if the self-check rejects the kernels
         random = ("backend.pretrained=false", "renderer.implementation=triton")
+        large = (8, (224, 448), (*random, "backend=da3_large"))
         giant = (15, (224, 448), (*random, "backend=da3_giant"))
         cases = {
-            "da3_large, 8 views": (8, (224, 448), (*random, "backend=da3_large")),
+            "da3_large, 8 views": large,
+            "da3_large, 8 views, compiled blocks": (*large[:2], (*large[2], COMPILED)),
             "da3_giant, 15 views": giant,
+            "da3_giant, 15 views, compiled blocks": (*giant[:2], (*giant[2], COMPILED)),
             "da3_giant, 15 views, trained too": (*giant[:2], (*giant[2], "backend.freeze=false")),
         }
     for name, (views, size, overrides) in cases.items():

@@ -52,6 +52,7 @@ class VG2GTModule(lightning.LightningModule):
             as rendered views need accurate cameras.
         render_views: maximum number of views rendered per training step, held-out views first; None renders all.
         rasterized_depth: also evaluate the depth of 3DGS rasterisation (``abs_rel_rasterized``).
+        compile_blocks: compile the backbone's transformer blocks (:meth:`backends.base.Backend.compile_blocks`).
         max_skipped: stop after this many consecutive steps with a non-finite loss or gradient.
         seed: combined with the step number to seed every random draw of a step, so that a resumed run makes the same
             draws as an uninterrupted one.
@@ -74,6 +75,7 @@ class VG2GTModule(lightning.LightningModule):
         pose_noise: float = 0.0,
         render_views: int | None = None,
         rasterized_depth: bool = False,
+        compile_blocks: bool = False,
         max_skipped: int = 20,
         seed: int = 0,
     ) -> None:
@@ -89,6 +91,8 @@ class VG2GTModule(lightning.LightningModule):
                 f"training.part={part} must be all or coarse, and training.pose_noise={pose_noise} a fraction of the "
                 "scenes, 0 with part=all: rendered views need accurate cameras to match the images"
             )
+        if compile_blocks:
+            model.backend.compile_blocks()
         self.model = model
         self.part = part
         if part == "coarse":
