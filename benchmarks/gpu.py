@@ -2,7 +2,8 @@
 
 Parts: forward and backward pass of the renderer (``render``), training steps of ``experiment=paper`` with random
 weights, by stage, with plain and compiled transformer blocks, and the device hours of a training of the paper's length
-(``step``), trainings on the same scenes with one GPU and all (``ddp``), ``reconstruct`` with 50 images (``reconstruct``), and ``pytest -m gpu`` (``tests``).
+(``step``), trainings on the same scenes with one GPU and all (``ddp``), ``reconstruct`` with 50 images
+(``reconstruct``), and ``pytest -m gpu`` (``tests``).
 After every measurement it writes ``<date>-gpu-<part>.json`` to ``--out`` (default: the variable OUT, or
 benchmarks/results), so that partial results are kept. ``--small`` makes all sizes tiny, also for a CPU.
 """

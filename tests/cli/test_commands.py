@@ -23,10 +23,10 @@ Said = Callable[..., tuple[object, str]]
 ALL: dict[tuple[str, ...], Command] = {(name,): command for name, command in COMMANDS.items()}
 ALL |= {("data", name): command for name, command in DATA_COMMANDS.items()}
 
-# Runs in one process all helps; torch and Lightning must not be imported for any.
+# Runs in one process all helps; torch and Lightning must not be imported for any, nor by what starts captures.
 HELPS = """
 import sys
-from vg2gt.cli import main
+from vg2gt.cli import captures, main
 for words in {words}:
     sys.argv = ["vg2gt", *words, "--help"]
     print("HELP OF", *words)

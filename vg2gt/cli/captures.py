@@ -24,7 +24,7 @@ from vg2gt.cli.errors import USER_ERRORS
 from vg2gt.config import config_dir
 from vg2gt.evaluation.tables import markdown_table
 from vg2gt.io.files import read_json, write_json, write_text
-from vg2gt.outputs.outputs import check_outputs
+from vg2gt.outputs.output_names import check_outputs
 
 if TYPE_CHECKING:
     from vg2gt.reconstruction.scene import Scene

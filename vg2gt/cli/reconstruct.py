@@ -20,7 +20,7 @@ from vg2gt.cli.arguments import (
     without_patterns,
 )
 from vg2gt.cli.errors import errors_in_one_line
-from vg2gt.outputs.output_names import DEFAULT, LARGE, OUTPUTS, PREDICTED, TILES
+from vg2gt.outputs.output_names import DEFAULT, LARGE, OUTPUTS, PREDICTED, TILES, check_outputs
 from vg2gt.reconstruction.windows import WINDOWS
 
 USAGE = "vg2gt reconstruct IMAGES... --out DIR [options] [KEY=VALUE ...]"
@@ -152,7 +152,7 @@ def _check(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     """Checks all arguments before weights are downloaded or any work is done."""
     from vg2gt.inputs.cameras import check_inputs
     from vg2gt.inputs.pictures import check_limit, count_pictures
-    from vg2gt.outputs.outputs import check_folder, check_outputs, check_space
+    from vg2gt.outputs.outputs import check_folder, check_space
     from vg2gt.reconstruction.trust import check_trust
     from vg2gt.reconstruction.windows.store import window_size
     from vg2gt.runs.load import backend_class

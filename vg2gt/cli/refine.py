@@ -9,7 +9,7 @@ from pathlib import Path
 
 from vg2gt.cli.arguments import WATCH, add_common_flags, flag_parser, separate, watching
 from vg2gt.cli.errors import errors_in_one_line
-from vg2gt.outputs.output_names import DEFAULT, OUTPUTS
+from vg2gt.outputs.output_names import DEFAULT, OUTPUTS, check_outputs
 
 HOW = """
 refine=NAME selects a file of configs/refine, refine.KEY=VALUE changes a key.
@@ -39,7 +39,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> None:
     """Refines a scene and writes the outputs."""
     from vg2gt.memory import memory_advice
     from vg2gt.monitor import Monitor
-    from vg2gt.outputs.outputs import check_folder, check_outputs, write_outputs
+    from vg2gt.outputs.outputs import check_folder, write_outputs
     from vg2gt.outputs.saved import read_scene
     from vg2gt.reconstruction.policy import read_options, refinement_for
     from vg2gt.reconstruction.refined import refine_scene, refinement_lines

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from vg2gt.cli.arguments import add_common_flags, flag_parser
 from vg2gt.cli.errors import errors_in_one_line
-from vg2gt.outputs.output_names import FPS, MAPS
+from vg2gt.outputs.output_names import FPS, MAPS, check_outputs
 
 OUTPUTS = {**MAPS, "video.gif": "the colour of all views as an animation", "video.mp4": "the same as H.264"}
 DEFAULT, MOVING = ("color.png",), ("video.mp4",)
@@ -70,7 +70,7 @@ def run(options: argparse.Namespace) -> None:
     from vg2gt.io import read_gaussians
     from vg2gt.io.video import require_pyav
     from vg2gt.monitor import Monitor
-    from vg2gt.outputs.outputs import animation, check_folder, check_outputs, cost_figures, feed, map_folder
+    from vg2gt.outputs.outputs import animation, check_folder, cost_figures, feed, map_folder
     from vg2gt.outputs.saved import renderer_of, scene_file
     from vg2gt.reconstruction.camera_path import CameraPath
     from vg2gt.reconstruction.scene import render_views

@@ -1,5 +1,9 @@
 """Names of the outputs of a scene. Imports nothing, so that a command's help is fast."""
 
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
 FPS = 24.0
 SFM = "sfm"  # subfolder of the output folder for cameras found by structure from motion
 
@@ -31,3 +35,14 @@ OUTPUTS = {
 TILES, LARGE = "tiles", 1_000_000  # the command adds tiles if there are more Gaussians
 DEFAULT = ("scene.ply", "cameras.json", "views.npz", "report.png", "report.json")
 PREDICTED = "predicted by the backbone"  # entry for such cameras in a report
+
+
+def check_outputs(outputs: Sequence[str], known: Mapping[str, str] = OUTPUTS) -> None:
+    """Checks names of outputs.
+
+    Raises:
+        ValueError: if a name is unknown or the list is empty; the message lists the known names.
+    """
+    for output in outputs or [""]:
+        if output not in known:
+            raise ValueError(f"unknown output {output!r}; choose from: {', '.join(known)}")

@@ -39,7 +39,7 @@ from vg2gt.io.solid import fuse_solid
 from vg2gt.io.video import video_writer
 from vg2gt.monitor import Monitor
 from vg2gt.outputs.export import exported_views
-from vg2gt.outputs.output_names import DEFAULT, MAPS, OUTPUTS, PREDICTED
+from vg2gt.outputs.output_names import DEFAULT, MAPS, PREDICTED, check_outputs
 from vg2gt.reconstruction.frame import place_figures
 from vg2gt.reconstruction.refined import refinement_figures
 from vg2gt.reconstruction.trust import trust_figures, trust_picture
@@ -57,17 +57,6 @@ _MESH_DEPTHS = 10.0  # maximum depth of the mesh, in median depths
 AddView: TypeAlias = "Callable[[RenderedView], None]"
 Sink: TypeAlias = AbstractContextManager[AddView]
 """Context manager that returns a consumer of rendered views; on exit it writes what needs all views."""
-
-
-def check_outputs(outputs: Sequence[str], known: Mapping[str, str] = OUTPUTS) -> None:
-    """Checks names of outputs.
-
-    Raises:
-        ValueError: if a name is unknown or the list is empty; the message lists the known names.
-    """
-    for output in outputs or [""]:
-        if output not in known:
-            raise ValueError(f"unknown output {output!r}; choose from: {', '.join(known)}")
 
 
 def check_folder(folder: str | Path, outputs: Sequence[str], overwrite: bool) -> Path:
@@ -97,7 +86,7 @@ def check_space(folder: str | Path, outputs: Sequence[str], images: int) -> None
 
     Args:
         folder: output folder.
-        outputs: names from :data:`OUTPUTS`.
+        outputs: names from :data:`vg2gt.outputs.output_names.OUTPUTS`.
         images: number of images.
 
     Raises:
@@ -129,7 +118,7 @@ def write_outputs(
     Args:
         scene: scene to write.
         folder: output folder, created if missing.
-        outputs: names from :data:`OUTPUTS`.
+        outputs: names from :data:`vg2gt.outputs.output_names.OUTPUTS`.
         overwrite: replace existing outputs.
         mesh_voxel: edge of the mesh voxels in scene units; None: two pixels at the median depth.
         figures: entries of ``report.json`` in addition to those of the scene.
