@@ -88,10 +88,10 @@ def step(setting: Setting) -> Iterator[Result]:
         giant = (15, (224, 448), (*random, "backend=da3_giant"))
         cases = {
             "da3_large, 8 views": large,
-            "da3_large, 8 views, compiled blocks": (*large[:2], (*large[2], COMPILED)),
             "da3_giant, 15 views": giant,
-            "da3_giant, 15 views, compiled blocks": (*giant[:2], (*giant[2], COMPILED)),
             "da3_giant, 15 views, trained too": (*giant[:2], (*giant[2], "backend.freeze=false")),
+            "da3_large, 8 views, compiled blocks": (*large[:2], (*large[2], COMPILED)),
+            "da3_giant, 15 views, compiled blocks": (*giant[:2], (*giant[2], COMPILED)),
         }
     for name, (views, size, overrides) in cases.items():
         for found in _step(setting, views, size, ("experiment=paper", "trainer=gpu", "data=synthetic", *overrides)):

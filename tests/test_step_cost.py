@@ -10,8 +10,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from tests.gpu_counts import as_on_a_gpu, count_step
 from tests.training_helpers import NARROW
 
-# Measured: 5,774 and 16; 8,276 and 22 before weights were cast together (da3_large: 6,046 and 16, 8,618 and 22).
-KERNELS, WAITS = 5_900, 16
+# Measured: 5,038 and 16 (da3_large: 5,310 and 16); before weights were cast together 8,276 and 22 (8,618 and 22).
+KERNELS, WAITS = 5_150, 16
 
 
 def test_kernels_and_waits_of_a_training_step(benchmark_script, tmp_path: Path) -> None:
@@ -21,7 +21,7 @@ def test_kernels_and_waits_of_a_training_step(benchmark_script, tmp_path: Path) 
     run, batch = common.prepare(2, (28, 56), overrides, torch.device("cpu"), tmp_path)
     kernels, waits = count_step(partial(common.whole_step(run), batch.context))
     assert 0 < waits.total() <= WAITS, waits.most_common()
-    assert 5_000 < kernels.total() <= KERNELS, kernels.most_common(30)
+    assert 4_500 < kernels.total() <= KERNELS, kernels.most_common(30)
 
 
 class FloatProducts(TorchDispatchMode):
