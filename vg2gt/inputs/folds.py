@@ -10,7 +10,7 @@ are removed. Where nothing surrounds the sides, images whose matches contradict 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence, Set
+from collections.abc import Callable, Mapping, Sequence, Set
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -39,7 +39,7 @@ _COVERED = 0.6  # of the cells that the best pair of either image covers: the fi
 _MOST = 0.5  # of a pair's matches, that must fit the cameras
 _FEWEST_FALSE = 3  # pairs of different places, below which nothing is removed
 _FEWEST_UNDECIDED = 0.1  # of the placed images, and at least three of them
-_ROUNDS = 2  # models of pairs that cover most, then of all that fit these
+_ROUNDS = 3  # models of pairs that cover most, until none differs
 
 
 @dataclass(frozen=True)
@@ -99,6 +99,7 @@ class _Seen:
             name: np.array([point.point3D_id if point.has_point3D() else -1 for point in image.points2D], np.int64)
             for name, image in self.images.items()
         }
+        self.points = {key: point.xyz for key, point in model.points3D.items()}
         self.sizes = {name: np.array(size) for name, size in matches.sizes.items()}
         self._features, self._raw = matches.features, matches.raw
         self._rays = {}
@@ -165,8 +166,20 @@ class _Seen:
         return float(((owners[0] == owners[1]) & (owners[0] >= 0)).mean())
 
     def fit(self, pair: tuple[str, str], rows: NDArray[np.int64]) -> float:
-        """Returns the share of a pair's matches that fit the two cameras."""
-        return float(np.isfinite(self._placed(pair, rows)[0]).all(1).mean())
+        """Returns the share of a pair's features at points of the model that are where their matches are.
+
+        0 if they are few. Two rays of a false match may meet, but the point is where the other feature is not.
+        """
+        good: list[NDArray[np.bool_]] = []
+        for side, name in enumerate(pair):
+            other = pair[1 - side]
+            owner = self.owner[name][rows[:, side]]
+            places = np.array([self.points[key] for key in owner[owner >= 0]]).reshape(-1, 3)
+            pixels, _ = self._pixels(other, self.poses[other], places)
+            far = np.linalg.norm(pixels - self._features[other][rows[owner >= 0, 1 - side]], axis=1)
+            good.append(far < _SHARED * self.sizes[other].max())
+        joined = np.concatenate(good)
+        return float(joined.mean()) if len(joined) >= _STRONG else 0.0
 
     def different(self, pair: tuple[str, str], rows: NDArray[np.int64]) -> float | None:
         """Returns the share of near images that shows something else in the one than in the other; None: unknown.
@@ -241,22 +254,34 @@ def count_cells(pixels: NDArray[np.float64], size: Sequence[int] | NDArray[np.in
     return np.bincount(cells[:, 1] * _CELLS + cells[:, 0], minlength=_CELLS * _CELLS)
 
 
-def _doubtful(models: Sequence[Reconstruction], matches: Matches) -> set[tuple[str, str]]:
-    """Returns the pairs of images whose matches may be of equal sides of different places; none if too few surely are.
-
-    Pairs that the models put near each other are compared directly. Of the images that show the same as one of a pair,
-    more may not differ from the other one than agree.
-    """
-    verdict: dict[tuple[str, str], bool] = {}  # True: of the same place
+def _verdicts(models: Sequence[Reconstruction], matches: Matches) -> dict[tuple[str, str], bool]:
+    """Returns which pairs of images, of those that the models put near each other, show the same place."""
+    verdict: dict[tuple[str, str], bool] = {}
     for model in models:
         seen = _Seen(model, matches)
         for pair in seen.pairs & matches.pairs.keys():
             share = seen.different(pair, matches.pairs[pair])
             if share is not None and (share >= _DIFFERENT or share <= _ALIKE):
                 verdict[pair] = share <= _ALIKE
+    return verdict
+
+
+def _differing(models: Sequence[Reconstruction], matches: Matches) -> set[tuple[str, str]]:
+    """Returns the pairs of images that show different places, though the models are made of their matches."""
+    views = [_Seen(model, matches) for model in models]
+    return {
+        pair
+        for pair, alike in _verdicts(models, matches).items()
+        if not alike and any(seen.explained(pair, matches.pairs[pair]) >= _EXPLAINED for seen in views)
+    }
+
+
+def _doubtful(verdict: Mapping[tuple[str, str], bool], matches: Matches) -> set[tuple[str, str]]:
+    """Returns the pairs of images whose matches may be of equal sides of different places.
+
+    Of the images that show the same as one of a pair, more may not differ from the other one than agree.
+    """
     found = {pair for pair, alike in verdict.items() if not alike}
-    if len(found) < _FEWEST_FALSE:
-        return set()
     same: dict[str, set[str]] = {name: set() for name in matches.features}
     other: dict[str, set[str]] = {name: set() for name in matches.features}
     for (one, two), alike in verdict.items():
@@ -352,16 +377,31 @@ def unfold(
         models: models made with all matches.
         again: makes the models again.
     """
-    if doubtful := _doubtful(models, matches):
-        everything = database.with_suffix(".all")
+    verdict = _verdicts(models, matches)
+    undecided: set[str] = set()
+    if sum(not alike for alike in verdict.values()) >= _FEWEST_FALSE:
+        everything, count = database.with_suffix(".all"), len(models[0].images)
         shutil.copyfile(database, everything)
-        kept = _covering(matches.without(doubtful))
-        for _ in range(_ROUNDS):
+
+        def models_of(kept: Set[tuple[str, str]]) -> tuple[list[Reconstruction], Matches]:
             shutil.copyfile(everything, database)
             _remove(database, matches.raw.keys() - kept)
-            models = again() or models
-            kept = _fitting(models, matches, kept)
-        matches = matches.without(matches.pairs.keys() - kept)
-    undecided = contradicted_images(models, matches)
+            return again() or models, matches.without(matches.pairs.keys() - kept)
+
+        tries: list[tuple[set[str], list[Reconstruction], Matches]] = []
+        for excluded in (set[tuple[str, str]](), _doubtful(verdict, matches)):
+            kept = _covering(matches.without(excluded))
+            for _ in range(_ROUNDS):
+                found, used = models_of(kept)
+                if not (false := _differing(found, used)):
+                    break
+                kept -= false
+            found, used = models_of(_fitting(found, matches, kept))
+            false = _differing(found, used)
+            tries.append(({name for pair in false for name in pair}, found, used))
+            if not false and len(found[0].images) >= count:
+                break
+        undecided, models, matches = min(tries, key=lambda each: (len(each[0]), -len(each[1][0].images)))
+    undecided |= set(contradicted_images(models, matches))
     enough = max(3, _FEWEST_UNDECIDED * len(models[0].images))
-    return models, undecided if len(undecided) >= enough else []
+    return models, sorted(undecided) if len(undecided) >= enough else []
