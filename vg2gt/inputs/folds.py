@@ -34,8 +34,9 @@ _STRONG = 30  # matches of a pair that must be in the model
 _EXPLAINED = 0.2  # of a pair's matches, below which the model contradicts it
 _RIVAL = 0.2  # of an image's best matched pair, from which a contradicted pair counts
 _OUTVOTED = 2  # images that tell a pair apart, beyond twice those that do not, though it looks alike itself
+_RARE = 0.3  # of an image's matched features: those that are matched in the fewest other images
 _FOUND = 2  # matches in a cell that a pair covers
-_COVERED = 0.6  # of the cells that the best pair of either image covers: the first models are made of such pairs
+_COVERED = 0.5  # of the cells that the best pair of either image covers: the first models are made of such pairs
 _MOST = 0.5  # of a pair's matches, that must fit the cameras
 _FEWEST_FALSE = 3  # pairs of different places, below which nothing is removed
 _FEWEST_UNDECIDED = 0.1  # of the placed images, and at least three of them
@@ -296,22 +297,28 @@ def _doubtful(verdict: Mapping[tuple[str, str], bool], matches: Matches) -> set[
 
 
 def _covering(matches: Matches) -> set[tuple[str, str]]:
-    """Returns the pairs of images that share most of what they share with any image.
+    """Returns the pairs of images that share what few others have, everywhere where one of them has it.
 
-    Equal sides have only themselves in common, neighbours also what surrounds them.
+    Equal sides are in many images, what surrounds them in neighbours only.
     """
-    used: dict[str, list[NDArray[np.int64]]] = {name: [] for name in matches.features}
+    counts = {name: np.zeros(len(found), int) for name, found in matches.features.items()}
     for pair, rows in matches.pairs.items():
         for side, name in enumerate(pair):
-            used[name].append(rows[:, side])
+            counts[name][np.unique(rows[:, side])] += 1
+    rare = {
+        name: (count > 0) & (count <= np.quantile(count[count > 0], _RARE))
+        for name, count in counts.items()
+        if count.any()
+    }
 
     def cells(name: str, rows: NDArray[np.int64]) -> NDArray[np.int64]:
         return count_cells(matches.features[name][rows], matches.sizes[name])
 
-    known = {name: cells(name, np.unique(np.concatenate(rows))) >= _FEWEST for name, rows in used.items() if rows}
+    known = {name: cells(name, np.flatnonzero(chosen)) >= _FEWEST for name, chosen in rare.items()}
     covered = {
         pair: min(
-            (known[name] & (cells(name, rows[:, side]) >= _FOUND)).sum() / max(known[name].sum(), 1)
+            (known[name] & (cells(name, rows[rare[name][rows[:, side]], side]) >= _FOUND)).sum()
+            / max(known[name].sum(), 1)
             for side, name in enumerate(pair)
         )
         for pair, rows in matches.pairs.items()
@@ -391,15 +398,18 @@ def unfold(
         tries: list[tuple[set[str], list[Reconstruction], Matches]] = []
         for excluded in (set[tuple[str, str]](), _doubtful(verdict, matches)):
             kept = _covering(matches.without(excluded))
+            found, used = models_of(kept)
             for _ in range(_ROUNDS):
-                found, used = models_of(kept)
-                if not (false := _differing(found, used)):
-                    break
-                kept -= false
+                false = _differing(found, used)
+                without = models_of(kept - false) if false else (found, used)
+                if not false or (len(false) < _FEWEST_FALSE and len(without[0][0].images) < len(found[0].images)):
+                    break  # also where a few that look different are all that links a part of the images
+                kept, (found, used) = kept - false, without
             found, used = models_of(_fitting(found, matches, kept))
             false = _differing(found, used)
-            tries.append(({name for pair in false for name in pair}, found, used))
-            if not false and len(found[0].images) >= count:
+            named = {name for pair in false for name in pair} if len(false) >= _FEWEST_FALSE else set[str]()
+            tries.append((named, found, used))
+            if not named and len(found[0].images) >= count:
                 break
         undecided, models, matches = min(tries, key=lambda each: (len(each[0]), -len(each[1][0].images)))
     undecided |= set(contradicted_images(models, matches))
