@@ -411,7 +411,10 @@ def unfold(
             tries.append((named, found, used))
             if not named and len(found[0].images) >= count:
                 break
-        undecided, models, matches = min(tries, key=lambda each: (len(each[0]), -len(each[1][0].images)))
+        undecided, models, used = min(tries, key=lambda each: (len(each[0]), -len(each[1][0].images)))
+        removed = matches.without(used.pairs.keys())
+        alike = {pair for pair, same in _verdicts(models, removed).items() if same}  # by all that surrounds them
+        matches = matches.without(removed.pairs.keys() - alike)
     undecided |= set(contradicted_images(models, matches))
     enough = max(3, _FEWEST_UNDECIDED * len(models[0].images))
     return models, sorted(undecided) if len(undecided) >= enough else []
