@@ -8,7 +8,7 @@ import pytest
 
 from tests.inputs.match_database import Dots, box, floor, orbit, write_database
 from vg2gt.inputs import sfm
-from vg2gt.inputs.folds import Matches, contradicted_images, unfold
+from vg2gt.inputs.folds import Matches, _covering, contradicted_images, unfold
 from vg2gt.inputs.motion import check_motion, why_not_placed
 from vg2gt.io.colmap import quiet_colmap
 from vg2gt.monitor import Monitor
@@ -61,6 +61,22 @@ def test_equal_sides_before_nothing_are_said(tmp_path: Path) -> None:
     _, models, undecided, matches = solved(tmp_path, box((1, 2, 1, 2)))
     assert len(undecided) >= 4
     assert undecided == contradicted_images(models, matches)
+
+
+def test_pairs_are_chosen_by_what_few_images_share() -> None:
+    """Sides that fill half of the image are in all of them, the ground only in neighbours: those are taken first."""
+    noise, names = np.random.default_rng(0), [f"{number:06d}.jpg" for number in range(12)]
+    side, ground = noise.uniform([400, 100], [1200, 900], (300, 2)), noise.uniform([0, 700], [1600, 1200], (200, 2))
+    features = dict.fromkeys(names, np.concatenate([side, ground]))
+    pairs = {}
+    for later in range(12):
+        for before in range(later):
+            rows = noise.permutation(300)[:200]
+            if (later - before) % 12 in (1, 11):
+                rows = np.concatenate([rows, 300 + noise.permutation(200)[:120]])
+            pairs[names[before], names[later]] = np.tile(rows[:, None], 2)
+    found = _covering(Matches(dict.fromkeys(names, (1600, 1200)), features, pairs, dict(pairs)))
+    assert found == {tuple(sorted((names[at], names[at - 1]))) for at in range(12)}
 
 
 def still(count: int, static: int, moving: int, shift: float) -> Matches:

@@ -69,6 +69,9 @@ def test_same_images_are_not_computed_again_and_the_unplaced_is_named(given: Pat
     assert "1 of 9 images overlap too little" in caplog.text
     assert "left out: 99999 of something else" in caplog.text
     assert {picture.source for picture in pictures} == {"structure from motion, 8 of 9 images"}
+    lenses = json.loads((solved / "sfm.json").read_text())["lenses"]  # of the photographs as taken, for control points
+    sizes = {picture.name: picture.size for picture in find_pictures(given)[:COUNT]}
+    assert {name: tuple(map(int, lens.split()[2:0:-1])) for name, lens in lenses.items()} == sizes
 
 
 def test_other_images_and_damaged_results_are_computed_anew(given: Path, solved: Path, tmp_path, monkeypatch) -> None:

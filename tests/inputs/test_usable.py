@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from PIL import Image, ImageFilter
+from PIL import Image, ImageEnhance, ImageFilter
 
 from tests.inputs.test_foreign import nvm
 from tests.inputs.test_given_cameras import NAMES, put_cameras, put_colmap, put_poses
@@ -106,11 +106,15 @@ def test_versions_of_a_photograph_are_left_out(tmp_path: Path, caplog) -> None:
 
     Sequences of related names and frames of two cameras side by side are kept, and the version of one that is spoilt.
     """
-    for folder in ("web", "left", "right"):
+    for folder in ("web", "left", "right", "edited"):
         (tmp_path / folder).mkdir()
     for number in range(4):
         photograph(number).save(tmp_path / f"IMG_{number}.jpg", quality=92)
         photograph(number).resize((216, 144)).save(tmp_path / "web" / f"IMG_{number}.jpg")
+        edited = ImageEnhance.Color(photograph(number).filter(ImageFilter.UnsharpMask())).enhance(0.4)
+        Image.eval(edited, lambda value: int(255 * (value / 255) ** 0.6)).save(
+            tmp_path / "edited" / f"IMG_{number}.jpg"
+        )
         photograph(number + 20).save(tmp_path / "left" / f"{number}.jpg", quality=92)
         shifted = np.roll(np.array(photograph(number + 20)), 1, 1)
         Image.fromarray(shifted).save(tmp_path / "right" / f"{number}.jpg", quality=92)

@@ -85,6 +85,30 @@ def test_pixels_that_are_not_square_are_stretched(tmp_path: Path, aspect: str, s
     assert np.ptp(columns) == pytest.approx(59, abs=1.5)
 
 
+@pytest.mark.parametrize("said", [True, False])
+@pytest.mark.parametrize("step", [0, 6])
+def test_half_images_of_two_times_become_the_first(tmp_path: Path, said: bool, step: int) -> None:
+    """As of camcorders: the rows of two times are told apart also if the file has lost the flag; else rows are kept."""
+    av = pytest.importorskip("av")
+    noise = np.random.default_rng(0).uniform(0, 255, (12, 30, 3)).astype(np.uint8)
+    scene = np.array(Image.fromarray(noise).resize((300, 120), Image.Resampling.BICUBIC))
+    first, second = (scene[:, shift : shift + 192] for shift in (40, 40 + step))
+    woven = np.ascontiguousarray(first)
+    woven[1::2] = second[1::2]
+    with av.open(str(tmp_path / "fields.mp4"), "w") as container:
+        stream = container.add_stream("libx264", 25, {"crf": "4", **({"flags": "+ilme+ildct"} if said else {})})
+        stream.width, stream.height, stream.pix_fmt = 192, 120, "yuv444p"
+        container.mux(stream.encode(av.VideoFrame.from_ndarray(woven, "rgb24")))
+        container.mux(stream.encode(None))
+    with av.open(str(tmp_path / "fields.mp4")) as container:
+        assert next(container.decode(video=0)).interlaced_frame == said
+    ((_, frame),) = read_video(tmp_path / "fields.mp4")
+    assert frame.shape == first.shape
+    assert np.abs(frame.astype(int) - first).mean() < 3
+    assert step == 0 or np.abs(woven.astype(int) - first).mean() > 9
+    assert np.array_equal(frame, read_frame(tmp_path / "fields.mp4", 0))
+
+
 def test_ten_bits_are_read_as_eight(tmp_path: Path) -> None:
     """As HDR videos of phones have."""
     av = pytest.importorskip("av")

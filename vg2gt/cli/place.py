@@ -28,8 +28,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     how = parser.add_mutually_exclusive_group(required=True).add_argument
     how("--scale", type=_scale, metavar="A,B=1.2m", help="two points of the scene, as the page's Measure shows "
         f"them, and their distance in {', '.join(_UNITS)}")  # fmt: skip
-    how("--control", type=Path, metavar="FILE", help="control points: a CSV with a line x,y,z,latitude,longitude,"
-        "altitude for each of three or more points, in the scene's frame, degrees and metres")  # fmt: skip
+    how("--control", type=Path, metavar="FILE", help="control points: OpenDroneMap's gcp_list.txt, or a CSV with lines "
+        "x,y,z,latitude,longitude,altitude for each point, in the scene's frame, degrees and metres")  # fmt: skip
     with errors_in_one_line():
         run(parser.parse_args(argv))
 
@@ -38,6 +38,7 @@ def run(arguments: argparse.Namespace) -> None:
     """Changes ``cameras.json`` and ``report.json``; the Gaussians stay as they are."""
     import numpy as np
 
+    from vg2gt.inputs.control_points import fit_control_points, read_control_points
     from vg2gt.io import read_cameras_json, write_cameras_json
     from vg2gt.io.files import read_json, write_json
     from vg2gt.reconstruction.frame import SceneFrame, place_figures
@@ -46,7 +47,12 @@ def run(arguments: argparse.Namespace) -> None:
     named, figures = read_cameras_json(cameras), read_json(report) if report.is_file() else {}
     metres, said = arguments.scale, ""
     if arguments.control is not None:
-        place = _control(arguments.control)
+        if arguments.control.suffix.lower() == ".csv":
+            place = _control(arguments.control)
+            figures.pop("control_points", None)
+        else:
+            place, off = fit_control_points(read_control_points(arguments.control), named, arguments.scene)
+            figures["control_points"] = off
         metres, said = place.scale, f"; control points are off by {place.error:.3g} m (median)"
         figures |= place_figures(SceneFrame("given", np.eye(4), place=place))
     elif "gps" in figures and abs(figures["metres_per_unit"] / metres - 1) > 0.01:

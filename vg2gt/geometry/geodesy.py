@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import cmath
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,6 +69,20 @@ def enu(positions: NDArray[np.float64], origin: NDArray[np.float64]) -> NDArray[
     turn = Rotation.from_euler("ZY", [origin[1], -origin[0]], degrees=True).as_matrix()
     up_east_north = (_earth_centred(positions) - _earth_centred(origin[None])) @ turn
     return up_east_north[:, [1, 2, 0]]
+
+
+def from_utm(east: float, north: float, zone: int, is_south: bool) -> tuple[float, float]:
+    """Returns latitude and longitude in degrees of UTM coordinates in metres (WGS 84), by Krueger's series."""
+    n = _FLATTENING / (2 - _FLATTENING)
+    radius = _EQUATOR / (1 + n) * (1 + n**2 / 4 + n**4 / 64) * 0.9996
+    flat = complex((north - 1e7 * is_south) / radius, (east - 5e5) / radius)
+    terms = (n / 2 - 2 * n**2 / 3 + 37 * n**3 / 96, n**2 / 48 + n**3 / 15, 17 * n**3 / 480)
+    flat -= sum(term * cmath.sin(2 * order * flat) for order, term in enumerate(terms, 1))
+    conformal = math.asin(math.sin(flat.real) / math.cosh(flat.imag))
+    terms = (2 * n - 2 * n**2 / 3 - 2 * n**3, 7 * n**2 / 3 - 8 * n**3 / 5, 56 * n**3 / 15)
+    latitude = conformal + sum(term * math.sin(2 * order * conformal) for order, term in enumerate(terms, 1))
+    longitude = math.atan2(math.sinh(flat.imag), math.cos(flat.real))
+    return math.degrees(latitude), math.degrees(longitude) + 6 * zone - 183
 
 
 def fit_place(centers: NDArray[np.float64], positions: NDArray[np.float64]) -> Place | None:

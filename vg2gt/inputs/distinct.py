@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
+from scipy import ndimage
 
 from vg2gt.data.transforms import to_bytes
 from vg2gt.inputs.folders import is_photo
@@ -24,9 +25,16 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-_VERSIONS = 4  # of a photograph at most; more files of related names are a sequence
+_VERSIONS = 4  # of a photograph in a folder at most; more files of related names are a sequence
 _SIDE, _SAME = 64, 0.985  # of reduced images, and least correlation of versions: those reduced to a half have .992 and
 # more, views next to each other .981 at most (fox, bananas, monstree, a room)
+_BLOCK, _FLAT, _FITS, _MOST = (
+    20,
+    2.0,
+    0.8,
+    0.9,
+)  # pixels of a block, least detail (values of 255) and correlation of its
+# fine detail, share of such blocks: 96 % and more after changes of colour, 28 % if shifted by 1/400 of the width
 
 
 def with_unique_names(pictures: Sequence[Picture]) -> list[Picture]:
@@ -75,18 +83,18 @@ class Versions:
     """
 
     def __init__(self, pictures: Sequence[Picture]) -> None:
-        names = {each.name: _plain(each.path.stem) for each in pictures if each.path is not None}
-        stems = set(names.values())
-        roots = {name: _root(stem, stems) for name, stem in names.items()}
-        counts = Counter(roots.values())
-        self._roots = {name: root for name, root in roots.items() if 1 < counts[root] <= _VERSIONS}
-        self._seen: dict[str, list[tuple[Picture, NDArray[np.float64]]]] = defaultdict(list)
+        paths = {each.name: each.path for each in pictures if each.path is not None}
+        stems = {_plain(path.stem) for path in paths.values()}
+        roots = {name: _root(_plain(path.stem), stems) for name, path in paths.items()}
+        counts = Counter((root, paths[name].parent) for name, root in roots.items())
+        sequences = {root for (root, _), count in counts.items() if count > _VERSIONS}
+        self._roots = {name: root for name, root in roots.items() if root not in sequences}
+        self._seen: dict[str, list[tuple[Picture, NDArray[np.uint8]]]] = defaultdict(list)
 
     def add(self, picture: Picture, pixels: NDArray[np.uint8]) -> None:
         """Takes the pixels ``[h, w, 3]`` of a reduced picture."""
         if picture.name in self._roots:
-            small = Image.fromarray(pixels).convert("L").resize((_SIDE, _SIDE), Image.Resampling.BILINEAR)
-            self._seen[self._roots[picture.name]].append((picture, np.asarray(small, float).ravel()))
+            self._seen[self._roots[picture.name]].append((picture, np.asarray(Image.fromarray(pixels).convert("L"))))
 
     def faults(self, others: Container[str]) -> dict[str, str]:
         """Returns which pictures show the same as a larger one, or as one of equal size and shorter name.
@@ -96,10 +104,14 @@ class Versions:
         """
         found: dict[str, str] = {}
         for group in self._seen.values():
-            kept: list[tuple[Picture, NDArray[np.float64]]] = []
+            kept: list[tuple[Picture, NDArray[np.uint8]]] = []
             usable = [each for each in group if each[0].name not in others]
             for picture, pixels in sorted(usable, key=lambda each: (-max(each[0].size), len(str(each[0].path)))):
-                same = [other for other, seen in kept if _related(picture, other) and _alike(pixels, seen)]
+                same = [
+                    other
+                    for other, seen in kept
+                    if _aligned(pixels, seen) or (_related(picture, other) and _alike(pixels, seen))
+                ]
                 if same:
                     found[picture.name] = f"shows the same as {same[0].path}"
                 else:
@@ -123,5 +135,27 @@ def _related(one: Picture, other: Picture) -> bool:
     return folders[0] == folders[1] or one.size != other.size
 
 
-def _alike(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
-    return min(one.std(), other.std()) > 0 and float(np.corrcoef(one, other)[0, 1]) >= _SAME
+def _alike(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> bool:
+    size = (_SIDE, _SIDE)
+    resized = (Image.fromarray(each).resize(size, Image.Resampling.BILINEAR) for each in (one, other))
+    small = np.stack([np.asarray(each, float).ravel() for each in resized])
+    return small.std(1).min() > 0 and float(np.corrcoef(small)[0, 1]) >= _SAME
+
+
+def _aligned(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> bool:
+    """Returns whether fine detail is at the same places, as in a copy of other colours, but not in a stereo pair."""
+    if one.shape != other.shape or min(one.shape) < _BLOCK:
+        return False
+    rows, columns = (side // _BLOCK for side in one.shape)
+
+    def detail(grey: NDArray[np.uint8]) -> NDArray[np.float64]:
+        fine = grey - ndimage.uniform_filter(grey.astype(float), 9)
+        blocks = fine[: rows * _BLOCK, : columns * _BLOCK].reshape(rows, _BLOCK, columns, _BLOCK).swapaxes(1, 2)
+        blocks = blocks.reshape(rows * columns, -1)
+        return blocks - blocks.mean(1, keepdims=True)
+
+    first, second = detail(one), detail(other)
+    spreads = np.stack([first.std(1), second.std(1)])
+    known = spreads.min(0) > _FLAT
+    fit = (first * second).mean(1)[known] / spreads[:, known].prod(0)
+    return known.sum() >= max(rows, columns) and bool((fit > _FITS).mean() >= _MOST)

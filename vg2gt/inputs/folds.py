@@ -9,7 +9,8 @@ are removed. Where nothing surrounds the sides, images whose matches contradict 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import shutil
+from collections.abc import Callable, Mapping, Sequence, Set
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,9 +34,13 @@ _STRONG = 30  # matches of a pair that must be in the model
 _EXPLAINED = 0.2  # of a pair's matches, below which the model contradicts it
 _RIVAL = 0.2  # of an image's best matched pair, from which a contradicted pair counts
 _OUTVOTED = 2  # images that tell a pair apart, beyond twice those that do not, though it looks alike itself
+_RARE = 0.3  # of an image's matched features: those that are matched in the fewest other images
+_FOUND = 2  # matches in a cell that a pair covers
+_COVERED = 0.5  # of the cells that the best pair of either image covers: the first models are made of such pairs
+_MOST = 0.5  # of a pair's matches, that must fit the cameras
 _FEWEST_FALSE = 3  # pairs of different places, below which nothing is removed
 _FEWEST_UNDECIDED = 0.1  # of the placed images, and at least three of them
-_ROUNDS = 3  # maximum number of times that the models are made again
+_ROUNDS = 3  # models of pairs that cover most, until none differs
 
 
 @dataclass(frozen=True)
@@ -77,7 +82,7 @@ class Matches:
                     table[min(one, other), max(one, other)] = rows if one < other else rows[:, ::-1]
         return Matches(sizes, features, *tables)
 
-    def without(self, removed: set[tuple[str, str]]) -> Matches:
+    def without(self, removed: Set[tuple[str, str]]) -> Matches:
         """Returns the matches; those of removed pairs are not verified."""
         return replace(self, pairs={pair: rows for pair, rows in self.pairs.items() if pair not in removed})
 
@@ -95,6 +100,7 @@ class _Seen:
             name: np.array([point.point3D_id if point.has_point3D() else -1 for point in image.points2D], np.int64)
             for name, image in self.images.items()
         }
+        self.points = {key: point.xyz for key, point in model.points3D.items()}
         self.sizes = {name: np.array(size) for name, size in matches.sizes.items()}
         self._features, self._raw = matches.features, matches.raw
         self._rays = {}
@@ -159,6 +165,22 @@ class _Seen:
             return 0.0
         owners = self.owner[pair[0]][rows[:, 0]], self.owner[pair[1]][rows[:, 1]]
         return float(((owners[0] == owners[1]) & (owners[0] >= 0)).mean())
+
+    def fit(self, pair: tuple[str, str], rows: NDArray[np.int64]) -> float:
+        """Returns the share of a pair's features at points of the model that are where their matches are.
+
+        0 if they are few. Two rays of a false match may meet, but the point is where the other feature is not.
+        """
+        good: list[NDArray[np.bool_]] = []
+        for side, name in enumerate(pair):
+            other = pair[1 - side]
+            owner = self.owner[name][rows[:, side]]
+            places = np.array([self.points[key] for key in owner[owner >= 0]]).reshape(-1, 3)
+            pixels, _ = self._pixels(other, self.poses[other], places)
+            far = np.linalg.norm(pixels - self._features[other][rows[owner >= 0, 1 - side]], axis=1)
+            good.append(far < _SHARED * self.sizes[other].max())
+        joined = np.concatenate(good)
+        return float(joined.mean()) if len(joined) >= _STRONG else 0.0
 
     def different(self, pair: tuple[str, str], rows: NDArray[np.int64]) -> float | None:
         """Returns the share of near images that shows something else in the one than in the other; None: unknown.
@@ -233,57 +255,94 @@ def count_cells(pixels: NDArray[np.float64], size: Sequence[int] | NDArray[np.in
     return np.bincount(cells[:, 1] * _CELLS + cells[:, 0], minlength=_CELLS * _CELLS)
 
 
-def _false_pairs(
-    models: Sequence[Reconstruction], matches: Matches, fewest: int = _FEWEST_FALSE
-) -> set[tuple[str, str]]:
-    """Returns the pairs of images whose matches are of equal sides of different places.
-
-    Pairs that are near each other are compared directly. Those that remain unclear follow their neighbours: a pair is
-    false if, of the images that show the same place as one of the two, more differ from the other one than agree.
-
-    Args:
-        models: models of the images, which may be folded.
-        matches: verified matches.
-        fewest: minimum number of pairs that show different places; with fewer, none is false.
-    """
-    verdict: dict[tuple[str, str], bool] = {}  # True: of the same place
+def _verdicts(models: Sequence[Reconstruction], matches: Matches) -> dict[tuple[str, str], bool]:
+    """Returns which pairs of images, of those that the models put near each other, show the same place."""
+    verdict: dict[tuple[str, str], bool] = {}
     for model in models:
         seen = _Seen(model, matches)
-        for pair, rows in matches.pairs.items():
-            share = seen.different(pair, rows) if pair in seen.pairs else None
+        for pair in seen.pairs & matches.pairs.keys():
+            share = seen.different(pair, matches.pairs[pair])
             if share is not None and (share >= _DIFFERENT or share <= _ALIKE):
                 verdict[pair] = share <= _ALIKE
-    if sum(not alike for alike in verdict.values()) < fewest:
-        return set()
-    changed = True
-    while changed:
-        votes = _votes(verdict, matches)
-        # first those that look alike by chance
-        change = {
-            pair: False for pair, (by, against) in votes.items() if verdict.get(pair) and against >= 2 * by + _OUTVOTED
-        }
-        change = change or {
-            pair: by > against for pair, (by, against) in votes.items() if pair not in verdict and by != against
-        }
-        verdict |= change
-        changed = bool(change)
-    return {pair for pair, alike in verdict.items() if not alike}
+    return verdict
 
 
-def _votes(verdict: Mapping[tuple[str, str], bool], matches: Matches) -> dict[tuple[str, str], tuple[int, int]]:
-    """Returns for each pair how many other images are of the same place as both, and as only one of them."""
+def _differing(models: Sequence[Reconstruction], matches: Matches) -> set[tuple[str, str]]:
+    """Returns the pairs of images that show different places, though the models are made of their matches."""
+    views = [_Seen(model, matches) for model in models]
+    return {
+        pair
+        for pair, alike in _verdicts(models, matches).items()
+        if not alike and any(seen.explained(pair, matches.pairs[pair]) >= _EXPLAINED for seen in views)
+    }
+
+
+def _doubtful(verdict: Mapping[tuple[str, str], bool], matches: Matches) -> set[tuple[str, str]]:
+    """Returns the pairs of images whose matches may be of equal sides of different places.
+
+    Of the images that show the same as one of a pair, more may not differ from the other one than agree.
+    """
+    found = {pair for pair, alike in verdict.items() if not alike}
     same: dict[str, set[str]] = {name: set() for name in matches.features}
     other: dict[str, set[str]] = {name: set() for name in matches.features}
     for (one, two), alike in verdict.items():
         for first, second in ((one, two), (two, one)):
             (same if alike else other)[first].add(second)
-    return {
-        (one, two): (len(same[one] & same[two]), len(same[one] & other[two]) + len(other[one] & same[two]))
-        for one, two in matches.pairs
+    for one, two in matches.pairs:
+        agree = len(same[one] & same[two])
+        against = len(same[one] & other[two]) + len(other[one] & same[two])
+        if against >= (2 * agree + _OUTVOTED if verdict.get((one, two)) else agree + 1):
+            found.add((one, two))
+    return found
+
+
+def _covering(matches: Matches) -> set[tuple[str, str]]:
+    """Returns the pairs of images that share what few others have, everywhere where one of them has it.
+
+    Equal sides are in many images, what surrounds them in neighbours only.
+    """
+    counts = {name: np.zeros(len(found), int) for name, found in matches.features.items()}
+    for pair, rows in matches.pairs.items():
+        for side, name in enumerate(pair):
+            counts[name][np.unique(rows[:, side])] += 1
+    rare = {
+        name: (count > 0) & (count <= np.quantile(count[count > 0], _RARE))
+        for name, count in counts.items()
+        if count.any()
     }
 
+    def cells(name: str, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+        return count_cells(matches.features[name][rows], matches.sizes[name])
 
-def _remove(database: Path, pairs: set[tuple[str, str]]) -> None:
+    known = {name: cells(name, np.flatnonzero(chosen)) >= _FEWEST for name, chosen in rare.items()}
+    covered = {
+        pair: min(
+            (known[name] & (cells(name, rows[rare[name][rows[:, side]], side]) >= _FOUND)).sum()
+            / max(known[name].sum(), 1)
+            for side, name in enumerate(pair)
+        )
+        for pair, rows in matches.pairs.items()
+    }
+    best: dict[str, float] = {}
+    for pair, share in covered.items():
+        for name in pair:
+            best[name] = max(best.get(name, 0.0), share)
+    return {pair for pair, share in covered.items() if share >= _COVERED * min(best[name] for name in pair)}
+
+
+def _fitting(
+    models: Sequence[Reconstruction], matches: Matches, otherwise: set[tuple[str, str]]
+) -> set[tuple[str, str]]:
+    """Returns the pairs whose matches fit the cameras of the first model that has both; else those of ``otherwise``."""
+    fit: dict[tuple[str, str], bool] = {}
+    for model in models:
+        seen = _Seen(model, matches)
+        for pair in seen.pairs & (matches.pairs.keys() - fit.keys()):
+            fit[pair] = seen.fit(pair, matches.pairs[pair]) > _MOST
+    return {pair for pair in matches.pairs if fit.get(pair, pair in otherwise)}
+
+
+def _remove(database: Path, pairs: Set[tuple[str, str]]) -> None:
     """Removes the matches of pairs from COLMAP's database."""
     import pycolmap  # pyright: ignore[reportMissingImports]
 
@@ -325,13 +384,37 @@ def unfold(
         models: models made with all matches.
         again: makes the models again.
     """
-    for number in range(_ROUNDS):
-        found = _false_pairs(models, matches, _FEWEST_FALSE if number == 0 else 1)
-        if not found:
-            break
-        _remove(database, found)
-        matches = matches.without(found)
-        models = again() or models
-    undecided = contradicted_images(models, matches)
+    verdict = _verdicts(models, matches)
+    undecided: set[str] = set()
+    if sum(not alike for alike in verdict.values()) >= _FEWEST_FALSE:
+        everything, count = database.with_suffix(".all"), len(models[0].images)
+        shutil.copyfile(database, everything)
+
+        def models_of(kept: Set[tuple[str, str]]) -> tuple[list[Reconstruction], Matches]:
+            shutil.copyfile(everything, database)
+            _remove(database, matches.raw.keys() - kept)
+            return again() or models, matches.without(matches.pairs.keys() - kept)
+
+        tries: list[tuple[set[str], list[Reconstruction], Matches]] = []
+        for excluded in (set[tuple[str, str]](), _doubtful(verdict, matches)):
+            kept = _covering(matches.without(excluded))
+            found, used = models_of(kept)
+            for _ in range(_ROUNDS):
+                false = _differing(found, used)
+                without = models_of(kept - false) if false else (found, used)
+                if not false or (len(false) < _FEWEST_FALSE and len(without[0][0].images) < len(found[0].images)):
+                    break  # also where a few that look different are all that links a part of the images
+                kept, (found, used) = kept - false, without
+            found, used = models_of(_fitting(found, matches, kept))
+            false = _differing(found, used)
+            named = {name for pair in false for name in pair} if len(false) >= _FEWEST_FALSE else set[str]()
+            tries.append((named, found, used))
+            if not named and len(found[0].images) >= count:
+                break
+        undecided, models, used = min(tries, key=lambda each: (len(each[0]), -len(each[1][0].images)))
+        removed = matches.without(used.pairs.keys())
+        alike = {pair for pair, same in _verdicts(models, removed).items() if same}  # by all that surrounds them
+        matches = matches.without(removed.pairs.keys() - alike)
+    undecided |= set(contradicted_images(models, matches))
     enough = max(3, _FEWEST_UNDECIDED * len(models[0].images))
-    return models, undecided if len(undecided) >= enough else []
+    return models, sorted(undecided) if len(undecided) >= enough else []

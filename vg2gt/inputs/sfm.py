@@ -31,6 +31,7 @@ from PIL import Image
 
 from vg2gt.data.sources.colmap_model import COLMAP, model_folder_of
 from vg2gt.data.sources.masks import mask_beside
+from vg2gt.data.sources.undistortion import lens_text
 from vg2gt.data.transforms import reduce_to_fit, to_bytes
 from vg2gt.inputs.distinct import digest
 from vg2gt.inputs.folds import Matches, unfold
@@ -194,6 +195,7 @@ def _solve(pictures: Sequence[Picture], folder: Path, key: str, monitor: Monitor
             "images": {name: title for name, title in titles.items() if name in placed},
             "left_out": [title for name, title in titles.items() if name not in placed],
             "other_parts": [[titles[name] for name in sorted(part)] for part in others if part],
+            "lenses": _lenses(models[0], dict(zip(names, pictures, strict=True))),
             "error": round(models[0].compute_mean_reprojection_error(), 2),
             "undecided": [titles[name] for name in undecided],
             "folded": 0 if models is folded else len(folded[0].images),
@@ -354,6 +356,12 @@ def _map(work: Path, count: int, monitor: Monitor) -> list[Reconstruction]:
         )
     sound = [model for model in models.values() if model.num_points3D() >= FEWEST_POINTS]
     return sorted(sound, key=lambda model: (model.num_reg_images(), model.num_points3D()), reverse=True)
+
+
+def _lenses(model: Reconstruction, pictures: dict[str, Picture]) -> dict[str, str]:
+    """Returns the lenses of the photographs as taken, by their names."""
+    placed = (image for image in model.images.values() if image.has_pose)
+    return {pictures[each.name].name: lens_text(each.camera, pictures[each.name].size) for each in placed}
 
 
 def _parts(models: Sequence[Reconstruction]) -> list[set[str]]:
