@@ -6,28 +6,15 @@ from pathlib import Path
 import pytest
 import torch
 
-from vg2gt.memory import (
-    TRAINING,
-    OutOfMemory,
-    dropped_by,
-    memory_advice,
-    note_sizes,
-)
+from vg2gt.memory import TRAINING, OutOfMemory, dropped_by, memory_advice, note_sizes
 from vg2gt.method import GaussianHead
 from vg2gt.studies.study import compose_run
 from vg2gt.training.loop import train
 from vg2gt.types import Voxels
 
 SMALL = [
-    "data.image_size=[28,28]",
-    "data.num_frames=6",
-    "data.train_scenes=1",
-    "data.eval_scenes=1",
-    "data.max_images=3",
-    "data.min_views=2",
-    "data.max_views=2",
-    "data.eval_context=2",
-    "data.eval_target=1",
+    *("data.image_size=[28,28]", "data.num_frames=6", "data.train_scenes=1", "data.eval_scenes=1"),
+    *("data.max_images=3", "data.min_views=2", "data.max_views=2", "data.eval_context=2", "data.eval_target=1"),
     "trainer.enable_progress_bar=false",
 ]
 

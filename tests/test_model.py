@@ -18,7 +18,7 @@ from vg2gt.types import Batch
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     cache = tmp_path_factory.mktemp("rooms")
-    views = ["data.image_size=[112,224]", "data.max_views=8", "data.max_images=8"]
+    views = ["data.image_size=[56,112]", "data.max_views=8", "data.max_images=8"]
     return build(small_config(tmp_path_factory.mktemp("run"), cache, *views))
 
 
@@ -83,10 +83,10 @@ def test_rays_that_meet_nothing_show_the_scenes_mean_colour(run: Run, model: VG2
     torch.testing.assert_close(seen, background[0, :, None, None].expand_as(seen))
     unseen = batch.context.hints.depth
     unseen = unseen.clone()
-    unseen[:, :, :40] = 0  # a sky
+    unseen[:, :, :20] = 0  # a sky
     hints = replace(batch.context.hints, depth=unseen)
     background = model(batch.context.images, hints).gaussians.background
-    sky = batch.context.images[..., :40, :].mean((1, 3, 4))
+    sky = batch.context.images[..., :20, :].mean((1, 3, 4))
     assert (
         float((background - sky).abs().max()) < 0.02 < float((sky - batch.context.images.mean((1, 3, 4))).abs().max())
     )
@@ -98,16 +98,6 @@ def test_rays_that_meet_nothing_show_the_scenes_mean_colour(run: Run, model: VG2
     other: Any = "white"
     with pytest.raises(ValueError, match=r"model\.background is 'white'; choose one of mean, black"):
         VG2GT(model.backend, SceneScale(), None, lambda **_: model.fine, lambda **_: model.gaussians, background=other)
-
-
-def test_held_out_images_never_touch_the_gaussians(model: VG2GT, batch: Batch) -> None:
-    changed = batch.images.clone()
-    changed[:, batch.num_context :] = 1 - changed[:, batch.num_context :]
-    other = replace(batch, images=changed)
-    one = model(batch.context.images, batch.context.hints).gaussians
-    two = model(other.context.images, other.context.hints).gaussians
-    assert torch.equal(one.means, two.means)
-    assert torch.equal(one.sh, two.sh)
 
 
 def test_target_cameras_of_both_protocols_agree(model: VG2GT, batch: Batch) -> None:

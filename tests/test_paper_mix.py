@@ -14,23 +14,11 @@ from vg2gt.config import compose
 from vg2gt.training.loop import build, train
 
 TINY = [
-    "backend=oracle",
-    "model=tiny",
-    "trainer=default",
-    "trainer.accelerator=cpu",
-    "trainer.devices=1",
-    "trainer.precision=32-true",
-    "trainer.max_steps=2",
-    "trainer.enable_progress_bar=false",
-    "++trainer.log_every_n_steps=1",
-    "callbacks.progress_bar=null",
-    "training.render_views=1",
-    "data.image_size=[28,56]",
-    "data.max_views=4",
-    "data.max_images=12",
-    "data.eval_context=3",
-    "data.eval_target=1",
-    "data.scannet_every=1",
+    *("backend=oracle", "model=tiny", "trainer=default", "trainer.accelerator=cpu", "trainer.devices=1"),
+    *("trainer.precision=32-true", "trainer.max_steps=2", "trainer.enable_progress_bar=false"),
+    *("++trainer.log_every_n_steps=1", "callbacks.progress_bar=null", "training.render_views=1"),
+    *("data.image_size=[28,56]", "data.max_views=4", "data.max_images=12", "data.eval_context=3"),
+    *("data.eval_target=1", "data.scannet_every=1"),
 ]
 
 

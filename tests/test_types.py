@@ -2,29 +2,7 @@
 
 import torch
 
-from vg2gt.types import Batch, Cameras, Gaussians, Voxels
-
-
-def cameras(scenes: int, views: int) -> Cameras:
-    poses = torch.eye(4).repeat(scenes, views, 1, 1)
-    return Cameras(poses, torch.eye(3).repeat(scenes, views, 1, 1), (4, 6))
-
-
-def test_batch_splits_context_and_target() -> None:
-    batch = Batch(
-        torch.arange(2 * 5).reshape(2, 5, 1, 1, 1).expand(2, 5, 3, 4, 6),
-        torch.zeros(2, 5, 4, 6),
-        cameras(2, 5),
-        torch.ones(2, dtype=torch.bool),
-        torch.arange(10).reshape(2, 5),
-        ("a", "b"),
-        3,
-    )
-    assert batch.context.frame_ids.tolist() == [[0, 1, 2], [5, 6, 7]]
-    assert batch.target.frame_ids.tolist() == [[3, 4], [8, 9]]
-    second = batch.single(1)
-    assert (second.scene, second.num_context) == (("b",), 3)
-    assert second.target.images[0, :, 0, 0, 0].tolist() == [8, 9]
+from vg2gt.types import Gaussians, Voxels
 
 
 def test_gaussians_of_a_scene_are_its_rows() -> None:

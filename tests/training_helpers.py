@@ -14,29 +14,16 @@ from vg2gt.runs.load import made_of
 from vg2gt.training.loop import Run
 
 SMALL = [
-    "data.image_size=[28,56]",
-    "data.train_scenes=2",
-    "data.eval_scenes=1",
-    "data.min_views=4",
-    "data.max_views=4",
-    "data.max_images=4",
-    "trainer.accelerator=cpu",
-    "trainer.enable_progress_bar=false",
-    "++trainer.log_every_n_steps=1",
-    "trainer.max_steps=4",
-    "callbacks.progress_bar=null",
+    *("data.image_size=[28,56]", "data.train_scenes=2", "data.eval_scenes=1", "training.render_views=1"),
+    *("data.min_views=4", "data.max_views=4", "data.max_images=4", "trainer.accelerator=cpu", "trainer.max_steps=4"),
+    *("trainer.enable_progress_bar=false", "callbacks.progress_bar=null", "++trainer.log_every_n_steps=1"),
     "callbacks.checkpoint.every_n_train_steps=2",
-    "training.render_views=1",
 ]
 # The layers of the paper's model with few channels.
 NARROW = [
-    "model.coarse.hidden=[64,32]",
-    "model.coarse.fuse_channels=32",
-    "model.coarse.ptv3.enc_channels=[32,32,32,32,32]",
-    "model.coarse.ptv3.dec_channels=[32,32,32,32]",
-    "model.coarse.ptv3.enc_heads=[2,2,2,2,2]",
-    "model.coarse.ptv3.dec_heads=[2,2,2,2]",
-    "++model.fine.dense_head.features=16",
+    *("model.coarse.hidden=[64,32]", "model.coarse.fuse_channels=32", "++model.fine.dense_head.features=16"),
+    *("model.coarse.ptv3.enc_channels=[32,32,32,32,32]", "model.coarse.ptv3.dec_channels=[32,32,32,32]"),
+    *("model.coarse.ptv3.enc_heads=[2,2,2,2,2]", "model.coarse.ptv3.dec_heads=[2,2,2,2]"),
 ]
 
 

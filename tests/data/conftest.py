@@ -1,26 +1,15 @@
 """A small dataset on disk and small sources."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-import torch
 
 from vg2gt.data import SceneDataModule, SyntheticScenes
-from vg2gt.types import Batch
 
 from .sources import layout_rgbd
 
 SIZE = (24, 32)
-
-
-def assert_same_batches(found: Iterable[Batch], expected: Iterable[Batch]) -> None:
-    """Equal to the last bit, one after another."""
-    for a, b in zip(found, expected, strict=True):
-        assert (a.scene, a.cameras.size) == (b.scene, b.cameras.size)
-        for name in ("frame_ids", "images", "depth"):
-            assert torch.equal(getattr(a, name), getattr(b, name))
-        assert torch.equal(a.cameras.intrinsics, b.cameras.intrinsics)
 
 
 def module_of(rooms: SyntheticScenes, **options) -> SceneDataModule:

@@ -6,7 +6,7 @@ from functools import partial
 import pytest
 
 from vg2gt.data import DataError, Mixture, RGBDFolder, SyntheticScenes
-from vg2gt.data.views.sampling import StepSampler, ViewSampler, usable_scenes
+from vg2gt.data.views.sampling import ViewSampler, usable_scenes
 
 from .conftest import SIZE, module_of
 
@@ -48,15 +48,6 @@ def test_batches_know_each_scenes_unit(rooms):
         direct = mixture.load(batch.scene[0], batch.frame_ids[0].tolist())
         assert float((direct.images - batch.images[0]).abs().max()) < 1e-6
     assert seen == {"rooms": 9, "other": 3}
-
-
-def test_weights_hold_when_the_number_of_views_varies():
-    mixture = _mixture(weights=(0.25, 0.75))
-    views = ViewSampler(2, 6, max_images=12)
-    sampler = StepSampler(mixture, usable_scenes(mixture, views, None), views, 1)
-    drawn = Counter(mixture.part(view.scene) for step in range(1000) for view in sampler.step(step))
-    share = drawn["rooms"] / sum(drawn.values())
-    assert abs(share - 0.25) < 0.015
 
 
 def test_a_mixture_of_mixtures_would_ignore_weights() -> None:

@@ -82,19 +82,6 @@ def test_held_out_frames_are_targets_and_never_trained_on(rooms, write_recording
     assert set(batch.context.frame_ids[0].tolist()) <= trained
 
 
-def test_a_folder_of_recordings_splits_by_scene(rooms, write_recording):
-    root = write_recording("a").parent
-    write_recording("b", scene=1)
-    assert RGBDFolder(str(root)).scenes == ("a", "b")
-    assert RGBDFolder([str(root / "b"), str(root / "a")]).scenes == ("b", "a")
-    train, val = RGBDFolder(str(root), scenes=["a"], holdout=None), RGBDFolder(str(root), scenes=["b"])
-    module = module_of(rooms, train=train, val=val)
-    module.setup()
-    assert next(iter(module.val_dataloader())).scene == ("b",)
-    with pytest.raises(DataError, match="two scenes are called a"):
-        RGBDFolder([str(root / "a"), str(root / "a")])
-
-
 def test_a_missing_root_names_the_path_and_the_remedy(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"nowhere.*data\.root=FOLDER"):
         RGBDFolder(str(tmp_path / "nowhere"))

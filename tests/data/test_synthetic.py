@@ -9,10 +9,7 @@ import torch
 
 from examples.worlds import Worlds
 from vg2gt.data import SyntheticScenes
-from vg2gt.data.synthetic.renderer import render_frame
 from vg2gt.data.synthetic.rooms import SyntheticRoom
-from vg2gt.geometry.cameras import project, unproject
-from vg2gt.types import Cameras
 
 from .conftest import SIZE
 from .warping import depth_differences
@@ -23,32 +20,6 @@ LARGE = (56, 112)
 def one(seed: int = 0, **options) -> Worlds:
     """A source of one scene of two small frames."""
     return Worlds(1, first_seed=seed, **{"num_frames": 2, "size": SIZE, **options})
-
-
-def test_points_of_one_frame_are_where_another_frame_sees_them():
-    """Points seen by frame 0 are cast again from frame 1, through the very position where they project."""
-    room = SyntheticRoom(3, 8, LARGE)
-    first = room.render([0], 1)[0]
-    poses = torch.from_numpy(room.world_to_camera)[None]
-    cameras = Cameras(poses, torch.from_numpy(room.intrinsics).expand(1, 8, 3, 3), room.size)
-    points = unproject(torch.from_numpy(first.depth).double()[None, None], cameras.select(slice(0, 1)))
-    pixels, z = project(points, cameras.select(slice(1, 2)))
-    errors = []
-    for y in range(2, 54, 6):
-        for x in range(2, 110, 6):
-            u, v = pixels[0, 0, y, x].tolist()
-            if not (0 < u < 111 and 0 < v < 55):
-                continue
-            shifted = room.intrinsics.copy()
-            shifted[:2, 2] -= (u, v)  # the position becomes pixel (0, 0)
-            depth = float(render_frame(room.world, room.world_to_camera[1], shifted, (1, 1)).depth[0, 0])
-            if depth > float(z[0, 0, y, x]) - 0.01:  # else frame 1 sees something in front of it
-                seen = depth * np.linalg.inv(room.intrinsics) @ (u, v, 1)
-                back = room.world_to_camera[0] @ np.linalg.inv(room.world_to_camera[1]) @ (*seen, 1)
-                pixel = room.intrinsics @ back[:3] / back[2]
-                errors.append(np.hypot(pixel[0] - x, pixel[1] - y))
-    assert len(errors) > 60
-    assert max(errors) < 0.02
 
 
 @pytest.mark.parametrize("variant", Worlds.variants)

@@ -20,23 +20,11 @@ def report(**settings: Any) -> dict[str, Any]:
         "scene/cv": 0.25,
     }
     known = {
-        "name": "test",
-        "weights": "none",
-        "model": "VG2GT",
-        "backend": {"name": "oracle", "weights": "0a" * 32},
-        "data": "Rooms",
-        "scenes": 1,
-        "index": "replica",
-        "size": [518, 518],
-        "alignment": "median",
-        "depth_range": [None, None],
-        "neighbors": 8,
-        "lpips": "VGG-16, version 0.1",
-        "points": {"threshold": 0.05, "cap": None},
-        "device": "cpu",
-        "paper": None,
-        "paper_obstacle": None,
-    }
+        "name": "test", "weights": "none", "model": "VG2GT", "backend": {"name": "oracle", "weights": "0a" * 32},
+        "data": "Rooms", "scenes": 1, "index": "replica", "size": [518, 518], "alignment": "median",
+        "depth_range": [None, None], "neighbors": 8, "lpips": "VGG-16, version 0.1", "device": "cpu",
+        "points": {"threshold": 0.05, "cap": None}, "paper": None, "paper_obstacle": None,
+    }  # fmt: skip
     views = {str(count): {"mean": scores, "scenes": {"room": scores}} for count in (3, 10)}
     return {"settings": known | settings, "views": views}
 
@@ -66,13 +54,7 @@ def test_the_papers_rows_stand_beside_ours() -> None:
     assert "tbl_depth_whole" not in enhanced
 
 
-PAPERS = {
-    "data": "Replica",
-    "size": (518, 518),
-    "alignment": "median",
-    "depth_range": [None, None],
-    "told": False,
-}
+PAPERS = {"data": "Replica", "size": (518, 518), "alignment": "median", "depth_range": [None, None], "told": False}
 
 
 @pytest.mark.parametrize(

@@ -21,8 +21,8 @@ def on_earth(metres: np.ndarray) -> np.ndarray:
     return ORIGIN + np.stack([north, east, metres[:, 2]], 1)
 
 
-def with_gps(path, position) -> Image.Exif:
-    """EXIF data of a photograph taken at a position."""
+def with_gps(path, position, latitude_reference: str | None = None) -> None:
+    """Writes into a photograph's EXIF data where it was taken."""
     exif = Image.Exif()
     tags, parts = ExifTags.GPS, []
     for angle in np.abs(position[:2]):
@@ -33,7 +33,7 @@ def with_gps(path, position) -> Image.Exif:
         tags.GPSAltitude: abs(position[2]),
     }
     exif[ExifTags.IFD.GPSInfo] = {
-        tags.GPSLatitudeRef: "N" if position[0] > 0 else "S",
+        tags.GPSLatitudeRef: ("N" if position[0] > 0 else "S") if latitude_reference is None else latitude_reference,
         tags.GPSLatitude: parts[0],
         tags.GPSLongitudeRef: "E" if position[1] > 0 else "W",
         tags.GPSLongitude: parts[1],
@@ -42,7 +42,6 @@ def with_gps(path, position) -> Image.Exif:
     with Image.open(path) as image:
         image.load()
         image.save(path, exif=exif)
-    return exif
 
 
 def test_metres_of_degrees() -> None:
@@ -64,16 +63,8 @@ def test_position_of_a_photograph(tmp_path, position) -> None:
 )
 def test_references_as_some_programs_write_them(tmp_path, side: str, sign: int | None) -> None:
     """A sign that is not known is no position, rather than one on the other half of the Earth."""
-    exif = Image.Exif()
-    tags = ExifTags.GPS
-    exif[ExifTags.IFD.GPSInfo] = {
-        tags.GPSLatitudeRef: side,
-        tags.GPSLatitude: (46.0, 30.0, 0.0),
-        tags.GPSLongitudeRef: "E",
-        tags.GPSLongitude: (7.0, 0.0, 0.0),
-        tags.GPSAltitude: 100.0,
-    }
-    Image.new("RGB", (8, 8)).save(tmp_path / "a.jpg", exif=exif)
+    Image.new("RGB", (8, 8)).save(tmp_path / "a.jpg")
+    with_gps(tmp_path / "a.jpg", (46.5, 7, 100), side)
     assert gps_position(tmp_path / "a.jpg") == (None if sign is None else (sign * 46.5, 7, 100))
 
 

@@ -1,6 +1,5 @@
 import math
 
-import pytest
 import torch
 
 from vg2gt.geometry.cameras import ray_directions
@@ -10,28 +9,9 @@ SIZE = (24, 30)
 K = torch.tensor([[33.0, 0, 14.2], [0, 29, 11.9], [0, 0, 1]], dtype=torch.float64)
 
 
-def plane_depth(normal: torch.Tensor, distance: float) -> torch.Tensor:
-    """z-depth of the plane ``normal . x = -distance``."""
-    return -distance / (ray_directions(K, SIZE) @ normal)
-
-
 def wavy_depth() -> torch.Tensor:
     y, x = torch.meshgrid(torch.linspace(0, 4, SIZE[0]), torch.linspace(0, 5, SIZE[1]), indexing="ij")
     return (3 + 0.05 * torch.sin(x) + 0.04 * torch.cos(2 * y)).double()
-
-
-@pytest.mark.parametrize("direction", [(0, 0, -1), (0.3, -0.2, -1), (-0.5, 0.6, -1), (0.0, -1.0, -0.4)])
-def test_a_plane_has_its_normal_everywhere_inside(direction) -> None:
-    normal = torch.tensor(direction, dtype=torch.float64)
-    normal = normal / normal.norm()
-    depth = plane_depth(normal, 2.0)
-    depth = torch.where(depth > 0, depth, 0)
-    normals, valid = normals_from_depth(depth, K, edge_threshold=0.5)
-    assert valid.any()
-    expected = normal[:, None].expand(3, int(valid.sum()))
-    torch.testing.assert_close(normals[:, valid], expected)
-    assert not valid[[0, -1]].any()
-    assert not valid[:, [0, -1]].any()
 
 
 def test_equals_the_cross_product_of_central_differences() -> None:

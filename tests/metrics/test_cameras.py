@@ -7,8 +7,6 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from tests.geometry.test_cameras import random_cameras
-from vg2gt.geometry.alignment import Similarity
-from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.metrics import camera_metrics, relative_pose_errors
 from vg2gt.types import Cameras
 
@@ -25,16 +23,6 @@ def test_errors_of_all_pairs_match_brute_force() -> None:
             angle = math.acos(abs(a @ b) / np.linalg.norm(a) / np.linalg.norm(b))
             assert float(rotation[scene, pair]) == pytest.approx(math.degrees(turn), rel=1e-9)
             assert float(translation[scene, pair]) == pytest.approx(math.degrees(angle), rel=1e-9)
-
-
-def test_frame_and_unit_do_not_matter() -> None:
-    reference = random_cameras(views=4)
-    rotation = quat_to_matrix(torch.tensor([[0.3, 1, -2, 0.5], [1, 0, 2, 1]], dtype=torch.float64))
-    scale, translation = torch.tensor([3.0, 0.2], dtype=torch.float64), torch.ones(2, 3, dtype=torch.float64)
-    similarity = Similarity(scale, rotation, translation)
-    errors = relative_pose_errors(similarity.apply_cameras(reference), reference)
-    assert all(float(error.max()) < 1e-5 for error in errors)
-    assert set(camera_metrics(reference, reference).values()) == {1.0}
 
 
 def test_known_turn_and_known_direction() -> None:

@@ -12,6 +12,7 @@ from PIL import Image
 
 from tests.reconstruction.conftest import run
 from vg2gt import io
+from vg2gt.data import Frames
 from vg2gt.geometry.cameras import project
 from vg2gt.io.files import portable
 from vg2gt.outputs.output_names import OUTPUTS
@@ -126,14 +127,21 @@ def test_nothing_is_replaced_unasked(written: Path, scene: Scene, tmp_path: Path
     assert not (tmp_path / "color" / "stale.png").exists()
 
 
+def renamed(folder: Path, frames: Frames, names: list[str]) -> Path:
+    """The recording's first photographs under other names, with a COLMAP model."""
+    place, count = folder.parent / "renamed", len(names)
+    for number, name in enumerate(names):
+        (place / "images" / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(folder / "images" / f"{8 + number:03d}.png", place / "images" / name)
+    poses, intrinsics = (each[None, :count].double() for each in (frames.world_to_camera, frames.intrinsics))
+    io.write_colmap(place / "sparse" / "0", io.colmap_from_views(Cameras(poses, intrinsics, (84, 112)), names))
+    return place
+
+
 def test_names_of_244_characters_and_folders_of_cameras_are_kept(folder: Path, frames, model, tmp_path: Path) -> None:
     """As COLMAP allows: files of equal names in the folder of each camera, and names as long as a disk allows."""
-    names, rig = ["back/1.png", f"back/{'n' * 240}.png", "front/1.png"], tmp_path / "rig"
-    for number, name in enumerate(names):
-        (rig / "images" / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(folder / "images" / f"{8 + number:03d}.png", rig / "images" / name)
-    cameras = Cameras(frames.world_to_camera[None, :3].double(), frames.intrinsics[None, :3].double(), (84, 112))
-    io.write_colmap(rig / "sparse" / "0", io.colmap_from_views(cameras, names))
+    names = ["back/1.png", f"back/{'n' * 240}.png", "front/1.png"]
+    rig = renamed(folder, frames, names)
     reconstruct_with(model, rig).save(tmp_path / "out", ["colmap", "nerfstudio", "color.png"])
     images = io.colmap_images(io.read_colmap(tmp_path / "out" / "colmap" / "sparse" / "0"))
     assert [image.name for image in images] == names
@@ -147,12 +155,8 @@ def test_names_of_244_characters_and_folders_of_cameras_are_kept(folder: Path, f
 
 def test_files_do_not_replace_each_other_where_case_is_ignored(folder: Path, frames, model, tmp_path: Path) -> None:
     """Windows and macOS: ``IMG_1.png``, ``img_1.png`` and ``IMG_1.PNG``."""
-    names, twins = ["IMG_1.png", "img_1.png", "IMG_1.PNG"], tmp_path / "twins"
-    (twins / "images").mkdir(parents=True)
-    for number, name in enumerate(names):
-        shutil.copy(folder / "images" / f"{8 + number:03d}.png", twins / "images" / name)
-    cameras = Cameras(frames.world_to_camera[None, :3].double(), frames.intrinsics[None, :3].double(), (84, 112))
-    io.write_colmap(twins / "sparse" / "0", io.colmap_from_views(cameras, names))
+    names = ["IMG_1.png", "img_1.png", "IMG_1.PNG"]
+    twins = renamed(folder, frames, names)
     reconstruct_with(model, twins).save(tmp_path / "out", ["colmap", "nerfstudio", "color.png"])
     for place in ("colmap/images", "nerfstudio/images", "color"):
         assert len({path.name.lower() for path in (tmp_path / "out" / place).iterdir()}) == 3
@@ -169,12 +173,8 @@ def test_files_do_not_replace_each_other_where_case_is_ignored(folder: Path, fra
 
 def test_names_that_windows_refuses_are_changed(folder: Path, frames, model, tmp_path: Path, caplog) -> None:
     """``photos\\1.png`` is what Linux makes of some ZIP files from Windows."""
-    names, odd = ["aux.png", "2024-05-01 12:30.png", "photos\\1.png", "con/NUL.tar.png"], tmp_path / "odd"
-    for number, name in enumerate(names):
-        (odd / "images" / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(folder / "images" / f"{8 + number:03d}.png", odd / "images" / name)
-    cameras = Cameras(frames.world_to_camera[None].double(), frames.intrinsics[None].double(), (84, 112))
-    io.write_colmap(odd / "sparse" / "0", io.colmap_from_views(cameras, names))
+    names = ["aux.png", "2024-05-01 12:30.png", "photos\\1.png", "con/NUL.tar.png"]
+    odd = renamed(folder, frames, names)
     reconstruct_with(model, odd).save(tmp_path / "out", ["colmap", "nerfstudio", "color.png"])
     images = io.colmap_images(io.read_colmap(tmp_path / "out" / "colmap" / "sparse" / "0"))
     written = ["_aux.png", "2024-05-01 12_30.png", "photos_1.png", "_con/_NUL.tar.png"]

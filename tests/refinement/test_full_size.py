@@ -244,9 +244,3 @@ def test_exposures_are_fitted_only_where_views_differ(start: Start) -> None:
 def test_options_out_of_range_are_named(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=f"refine.full.{name} must be"):
         FullSizeOptions(**{name: value})
-
-
-def test_cameras_have_the_size_of_the_photographs(start: Start, photographs: Photographs) -> None:
-    found = photographs.cameras(start.cameras)
-    assert isinstance(found, Cameras)
-    assert (found.size, tuple(found.intrinsics.shape)) == (FULL, (1, VIEWS, 3, 3))

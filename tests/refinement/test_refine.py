@@ -103,14 +103,6 @@ def test_geometry_counts_in_every_nth_step(start: Start, monkeypatch: pytest.Mon
     assert set(weights[:-8]) == {0.0}  # scores
 
 
-def test_a_price_of_opacity_makes_gaussians_transparent(start: Start) -> None:
-    plain, priced = (
-        begun(start, RefineOptions(steps=9, fill=0, loss=replace(COLOUR, opacity=weight)), 4).opacities.mean()
-        for weight in (0.0, 9.0)
-    )
-    assert priced < plain - 0.002
-
-
 def test_what_only_left_out_views_show_keeps_its_opacity(start: Start) -> None:
     views = torch.arange(VIEWS)
     alone = contributions(start.gaussians, start.cameras.select(views[2:]), start.renderer) <= 1e-6

@@ -155,15 +155,6 @@ def test_no_gradient_passes_the_alpha_cap(implementation: Implementation) -> Non
     assert not any(g.any() for g in grads)
 
 
-def test_rasterized_median_moves_with_one_gaussian_only() -> None:
-    gaussians, cameras = with_gradients(soup(40)), pinhole((20, 24))
-    out = render(gaussians, cameras, "rasterized", implementation="cpu")
-    row, column = torch.nonzero(out.depth[0, 0] > 0)[0].tolist()
-    (grad,) = torch.autograd.grad(out.depth[0, 0, row, column], gaussians.means)
-    assert (grad.abs().sum(-1) > 0).sum() == 1
-    assert float(grad[:, 2].sum()) == pytest.approx(1.0)
-
-
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("count", [0, 1, 3000])
 def test_equal_depths_keep_their_order(dtype: type[np.floating], count: int) -> None:

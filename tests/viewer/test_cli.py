@@ -1,6 +1,5 @@
 """`vg2gt view`: what it writes, and one clear line for everything that is wrong."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -70,14 +69,6 @@ def test_images_that_reconstruct_writes_are_found(files: Path, capsys: pytest.Ca
     (files / "views.npz").write_bytes(b"nonsense")
     with pytest.raises(SystemExit, match=r"cannot read .*views\.npz"):
         run(files / "scene.ply")
-
-
-def test_cameras_of_3d_gaussian_splatting(files: Path) -> None:
-    camera = {"id": 0, "img_name": "0", "width": 56, "height": 40, "fx": 50.0, "fy": 50.0}
-    camera |= {"position": [0.0, 0.0, -2.0], "rotation": np.eye(3).tolist()}
-    (files / "cameras.json").write_text(json.dumps([camera]))
-    run(files / "scene.ply")
-    assert len(read_viewer_html(files / "scene.html")) == 60
 
 
 def test_mistakes_end_with_one_line(files: Path) -> None:

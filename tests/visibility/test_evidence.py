@@ -5,7 +5,6 @@ import math
 import pytest
 import torch
 
-from vg2gt.geometry.cameras import scale_translations
 from vg2gt.types import Cameras, Geometry
 from vg2gt.visibility import Status, pixel_evidence, point_support
 from vg2gt.visibility.evidence import EVIDENCE
@@ -69,14 +68,6 @@ def test_the_differences_are_their_upper_quartile_and_unknown_without_overlap(ca
     assert 0.09 < differences[0, 0, 0].exp() < 0.11
     alone = Geometry(seen.depth[:, :1], seen.depth_conf[:, :1], cameras.select(slice(0, 1)), seen.scale)
     assert (pixel_evidence(alone)[0][..., -1] == 0).all()
-
-
-def test_it_does_not_depend_on_the_unit(cameras: Cameras) -> None:
-    seen = geometry(cameras)
-    seen.depth[0, 0, :20] *= 1.3
-    larger = Geometry(7 * seen.depth, seen.depth_conf, scale_translations(cameras, torch.tensor([7.0])), seen.scale)
-    for mine, theirs in zip(pixel_evidence(seen), pixel_evidence(larger), strict=True):
-        torch.testing.assert_close(mine, theirs, atol=1e-4, rtol=1e-4)
 
 
 def test_the_status_of_points(cameras: Cameras) -> None:

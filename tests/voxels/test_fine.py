@@ -4,7 +4,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from tests.voxels.conftest import take_views
 from vg2gt.geometry.cameras import camera_centers, scale_translations, unproject
 from vg2gt.method.additions.point_moments import pool_point_moments
 from vg2gt.method.grid import plan_voxels, pool_mean
@@ -87,21 +86,6 @@ def test_scaling_scene_and_voxel_by_a_power_of_two(make_fine, make_room):
     assert torch.equal(small.features, large.features)
     torch.testing.assert_close(4 * small.centroid, large.centroid)
     torch.testing.assert_close(4 * small.voxel_size, large.voxel_size)
-
-
-def test_duplicated_views_add_no_voxels_and_new_views_few(make_fine, make_room):
-    inputs = make_room(views=6)
-    module = make_fine()
-    three, repeated, six = (
-        module(*take_views(inputs, views)) for views in ([0, 1, 2], [0, 1, 2, 1], [0, 1, 2, 3, 4, 5])
-    )
-    assert torch.equal(three.grid, repeated.grid)
-    assert torch.equal(three.confidence, repeated.confidence)
-    everything = module(*take_views(inputs, [0, 1, 2, 0, 1, 2]))
-    assert torch.equal(three.grid, everything.grid)
-    torch.testing.assert_close(three.centroid, everything.centroid)
-    torch.testing.assert_close(three.features, everything.features, atol=1e-4, rtol=1e-4)
-    assert len(three.grid) < len(six.grid) < 1.8 * len(three.grid)
 
 
 def test_cap_keeps_the_most_confident_and_says_so(make_fine, make_room, caplog):

@@ -60,16 +60,6 @@ def test_gradients_of_values_and_weights(left_out):
     assert torch.autograd.gradcheck(lambda n: pool_min(n, plan), (weights,))
 
 
-def test_shifting_by_whole_voxels_shifts_the_grid_only():
-    points, _, values, weights = cloud()
-    batch = torch.zeros(len(points), dtype=torch.int64)
-    size = torch.tensor([0.125])
-    shift = torch.tensor([3, -5, 40])
-    plan, moved = (planned(places, batch, size=size) for places in (points, points + shift * 0.125))
-    assert torch.equal(moved.grid, plan.grid + shift)
-    assert torch.equal(pool_mean(values, weights, plan), pool_mean(values, weights, moved))
-
-
 def test_points_on_faces_fall_by_division_and_cells_too_far_apart_are_refused_by_name():
     size = torch.tensor([0.1])
     count = torch.arange(-50, 50, dtype=torch.float64)

@@ -1,6 +1,7 @@
 """COLMAP scenes: a real model, which cameras are refused, reduced images, absent images, points."""
 
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -53,15 +54,19 @@ def test_real_model_reprojects(statue):
     assert not source.is_metric
 
 
+def distort(folder: Path) -> None:
+    model = read_colmap(folder)
+    for camera in model.cameras.values():
+        fx, _, cx, cy = camera.params
+        camera.model, camera.params = "SIMPLE_RADIAL", [fx, cx, cy, 0.02]
+    write_colmap(folder, model)
+
+
 def test_distorted_images_are_undistorted_when_read(tmp_path):
     """Item 16: COLMAP's default camera."""
     frames = room(3)
     write(tmp_path, frames)
-    model = read_colmap(tmp_path / "statue" / "sparse" / "0")
-    for camera in model.cameras.values():
-        fx, _, cx, cy = camera.params
-        camera.model, camera.params = "SIMPLE_RADIAL", [fx, cx, cy, 0.02]
-    write_colmap(tmp_path / "statue" / "sparse" / "0", model)
+    distort(tmp_path / "statue" / "sparse" / "0")
     source = COLMAP(str(tmp_path), depth="points")
     index = source.scene_index("statue")
     assert index.lens(1).startswith("SIMPLE_RADIAL 40 30")
@@ -79,11 +84,8 @@ def test_distorted_images_are_undistorted_when_read(tmp_path):
 def test_large_images_are_reduced_with_their_cameras(tmp_path, distorted: bool, monkeypatch) -> None:
     frames = room(3)
     write(tmp_path, frames)
-    model = read_colmap(tmp_path / "statue" / "sparse" / "0")
-    for camera in model.cameras.values() if distorted else ():
-        fx, _, cx, cy = camera.params
-        camera.model, camera.params = "SIMPLE_RADIAL", [fx, cx, cy, 0.02]
-    write_colmap(tmp_path / "statue" / "sparse" / "0", model)
+    if distorted:
+        distort(tmp_path / "statue" / "sparse" / "0")
     source = COLMAP(str(tmp_path))
     whole = source.load_whole("statue", 1)
     monkeypatch.setattr("vg2gt.io.image_files._LARGE", 100)

@@ -39,6 +39,9 @@ def test_a_list_in_a_file_may_name_scenes_that_are_not_there(dataset, tmp_path, 
     path.write_text("a\nb\na\n")
     with pytest.raises(DataError, match="names a twice"):
         RGBDFolder(str(dataset), scenes=str(path))
+    assert RGBDFolder([str(dataset / name) for name in "ba"]).scenes == ("b", "a")
+    with pytest.raises(DataError, match="two scenes are called a"):
+        RGBDFolder([str(dataset / name) for name in "aa"])
 
 
 def test_few_indices_stay_in_memory_and_the_rest_come_from_the_cache(dataset, tmp_path, monkeypatch):

@@ -144,22 +144,6 @@ def test_blenders_synthetic_sets(tmp_path):
         assert len(given_pictures(given) or []) == count  # test frames only if they are asked for
 
 
-def test_masks_of_a_rig_are_those_of_their_camera(tmp_path):
-    write(tmp_path, room(2))
-    images, masks = tmp_path / "desk" / "images", tmp_path / "desk" / "masks"
-    for i in range(2):
-        (images / f"cam{i}").mkdir()
-        (images / f"{i:04d}.png").rename(images / f"cam{i}" / "0.png")
-        save(masks / f"cam{i}" / "0.png", LEFT_HALF if i else np.full_like(LEFT_HALF, 255))
-    files = {f"images/{i:04d}": f"images/cam{i}/0.png" for i in range(2)}
-    _edit(
-        tmp_path,
-        lambda content: [f.update(file_path=files[f["file_path"].removesuffix(".png")]) for f in content["frames"]],
-    )
-    mask = Nerfstudio(str(tmp_path)).load("desk", [0, 1]).mask
-    assert mask.mean((1, 2)).tolist() == [1, 0.5]
-
-
 def test_masks_that_are_named_and_one_that_is_missing(tmp_path):
     write(tmp_path, room(2))
     save(tmp_path / "desk" / "m" / "0.png", LEFT_HALF)

@@ -17,24 +17,6 @@ def listed(frames: Sequence[int], held_out: Sequence[int] = ()) -> SceneSource:
     return source
 
 
-@pytest.mark.parametrize("count", [1, 3, 10, 20])
-def test_views_lie_in_a_limited_range_and_targets_between_them(count: int) -> None:
-    source, selection = listed(range(0, 600, 3)), ViewSelection(spread=3.0, targets=4)
-    starts = set()
-    for scene in map(str, range(30)):
-        views = selection.draw(source, scene, count)
-        assert (len(views.context), len(views.target)) == (count, min(4, len(views.target)))
-        assert not set(views.context) & set(views.target)
-        assert list(views.context) == sorted(views.context)
-        chosen = [*views.context, *views.target]
-        assert max(chosen) - min(chosen) <= 3 * max(3 * count, count + 4)
-        inside = [frame for frame in views.target if views.context[0] < frame < views.context[-1]]
-        free = [f for f in range(views.context[0], views.context[-1], 3) if f not in views.context]
-        assert len(inside) == min(4, len(free)) or not free
-        starts.add(views.context[0])
-    assert len(starts) > 20  # anywhere in the scene
-
-
 @pytest.mark.parametrize("count", [1, 8])
 def test_a_window_grows_until_it_holds_a_held_out_frame(count: int) -> None:
     source = listed(range(200), held_out=range(0, 200, 8))

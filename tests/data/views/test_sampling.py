@@ -25,19 +25,6 @@ def test_the_samples_of_one_dataset_never_change(sampler, digest):
     assert hashlib.sha256(json.dumps(drawn).encode()).hexdigest() == digest
 
 
-def test_all_ranks_draw_the_same_number_of_views_and_other_scenes():
-    source = SyntheticScenes(40, num_frames=20)
-    views = ViewSampler(2, 6, max_images=12)
-    ranks = [StepSampler(source, source.scenes, views, 100, rank=rank, world_size=2) for rank in range(2)]
-    for step in range(30):
-        a, b = (sampler.step(step) for sampler in ranks)
-        assert {len(view.context) for view in (*a, *b)} == {views.num_views(step)}
-        assert len(a) == len(b)
-    first_pass = 40 // (2 * 6)  # whole steps within the first pass over the scenes
-    seen = [view.scene for step in range(first_pass) for sampler in ranks for view in sampler.step(step)]
-    assert len(seen) == len(set(seen))
-
-
 def test_parts_are_drawn_exactly_by_weight_and_each_in_passes():
     parts = tuple(tuple(f"{name}{i}" for i in range(count)) for name, count in (("a", 3), ("b", 40), ("c", 1)))
     pool = ScenePool(parts, shares({"a": 0.5, "b": 0.3, "c": 0.2}), seed=1)
@@ -60,22 +47,6 @@ def test_shares_are_the_weights_exactly_and_many_digits_are_refused():
         shares({"a": 0.123456789, "b": 1.0})
 
 
-def test_views_are_distinct_frames_of_a_window_around_the_anchor():
-    sampler = ViewSampler(3, 9, expand_ratio=1.5, target_views=2)
-    frames = list(range(100, 400, 2))
-    starts = set()
-    for step in range(300):
-        views = sampler.views(step, "scene", frames, slot=0)
-        chosen = (*views.context, *views.target)
-        assert (len(views.context), len(views.target)) == (sampler.num_views(step), 2)
-        assert len(set(chosen)) == len(chosen)
-        assert set(chosen) <= set(frames)
-        window = max(len(chosen), round(1.5 * len(views.context)))
-        assert max(chosen) - min(chosen) <= 2 * (window - 1)
-        starts.add(views.context[0])
-    assert len(starts) > 100
-
-
 def test_view_sets_are_fixed_draws_per_scene():
     """Two sets per scene: over many steps every scene shows exactly two, other scenes others."""
     sampler = ViewSampler(4, 4, 4, 2.0, 2, seed=0, view_sets=2)
@@ -87,20 +58,6 @@ def test_view_sets_are_fixed_draws_per_scene():
     assert drawn["a"].isdisjoint(drawn["b"])
     with pytest.raises(ValueError, match=r"data\.view_sets"):
         ViewSampler(view_sets=0)
-
-
-def test_a_step_does_not_depend_on_where_the_iteration_began():
-    source = SyntheticScenes(9, num_frames=12)
-    views = ViewSampler(2, 4, max_images=8, target_views=1, seed=5)
-    whole = StepSampler(source, source.scenes, views, steps=10)
-    expected = [whole.step(step) for step in range(20)]
-    assert list(whole) == expected[:10]
-    resumed = StepSampler(source, source.scenes, views, steps=10, start_step=lambda: 7)
-    assert list(resumed) == expected[7:10]  # up to the end of the epoch
-    second_epoch = StepSampler(source, source.scenes, views, steps=10, start_step=lambda: 10)
-    assert list(second_epoch) == expected[10:20]
-    other_seed = StepSampler(source, source.scenes, ViewSampler(2, 4, 8, target_views=1, seed=6), steps=10)
-    assert list(other_seed) != expected[:10]
 
 
 def test_scenes_that_are_too_short_or_cannot_be_indexed_are_left_out(caplog):
