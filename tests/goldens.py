@@ -73,9 +73,7 @@ def _reconstruct() -> Values:
     found: dict[str, torch.Tensor] = {}
     for index, view in enumerate(scene.render()):
         found |= {f"{name} {index}": getattr(view, name) for name in ("color", "depth", "normal", "alpha")}
-    for name in ("means", "log_scales", "scales", "rotations", "opacities", "harmonics"):
-        if isinstance(tensor := getattr(scene.gaussians, name, None), torch.Tensor):
-            found[name] = tensor
+    found |= {name: getattr(scene.gaussians, name) for name in ("means", "quats", "scales", "opacities", "sh")}
     return {name: _digest(tensor) for name, tensor in found.items()}
 
 

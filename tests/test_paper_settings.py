@@ -62,7 +62,7 @@ BOOKKEEPING = (
     "data.train.", "data.val.", "data.train_scenes", "data.view_sets", "data.infinigen_root",
     "data.kitti_root", "data.kitti_depth_root", "data.scannet_root",
     "model.fine.dense_head.views_per_chunk", "model.fine.point_mlp.checkpoint",
-    "model.scale.median_depth", "renderer.implementation", "optimizer.fused", "training.max_skipped",
+    "model.scale.median_depth", "renderer.implementation", "optimizer.fused", "training.max_skipped", "training.compile_blocks",
     "training.backend_lr_factor",
     "trainer.accelerator", "trainer.strategy", "trainer.max_epochs", "trainer.deterministic", "trainer.log_every",
     "trainer.check_val", "trainer.val_check", "trainer.num_sanity", "trainer.limit_val", "trainer.fast_dev_run",
