@@ -8,13 +8,9 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from vg2gt.cli.arguments import flag_parser
 from vg2gt.cli.errors import errors_in_one_line
-
-if TYPE_CHECKING:
-    from vg2gt.geometry.geodesy import Place
 
 _UNITS = {"mm": 0.001, "cm": 0.01, "m": 1.0, "km": 1000.0, "in": 0.0254, "ft": 0.3048}
 _SCALE = re.compile(rf"(.+)=\s*([\d.eE+-]+)\s*({'|'.join(_UNITS)})")
@@ -38,7 +34,7 @@ def run(arguments: argparse.Namespace) -> None:
     """Changes ``cameras.json`` and ``report.json``; the Gaussians stay as they are."""
     import numpy as np
 
-    from vg2gt.inputs.control_points import fit_control_points, read_control_points
+    from vg2gt.inputs.control_points import fit_control_points, place_of_csv, read_control_points
     from vg2gt.io import read_cameras_json, write_cameras_json
     from vg2gt.io.files import read_json, write_json
     from vg2gt.reconstruction.frame import SceneFrame, place_figures
@@ -48,7 +44,7 @@ def run(arguments: argparse.Namespace) -> None:
     metres, said = arguments.scale, ""
     if arguments.control is not None:
         if arguments.control.suffix.lower() == ".csv":
-            place = _control(arguments.control)
+            place = place_of_csv(arguments.control)
             figures.pop("control_points", None)
         else:
             place, off = fit_control_points(read_control_points(arguments.control), named, arguments.scene)
@@ -77,22 +73,3 @@ def _scale(text: str) -> float:
     if not distance > 0:
         raise argparse.ArgumentTypeError("the two points are the same")
     return length / distance
-
-
-def _control(file: Path) -> Place:
-    """Returns the place that a file of control points gives."""
-    import numpy as np
-
-    from vg2gt.geometry.geodesy import place_of_points
-
-    expected = f"{file}: expected three or more lines x,y,z,latitude,longitude,altitude"
-    try:
-        rows = np.loadtxt(file, delimiter=",", ndmin=2)
-    except ValueError as error:
-        raise ValueError(f"{expected} ({error})") from error
-    if rows.shape[1] != 6 or len(rows) < 3 or not np.isfinite(rows).all():
-        raise ValueError(f"{expected}, got {len(rows)} of {rows.shape[1]} numbers")
-    place = place_of_points(rows[:, :3], rows[:, 3:])
-    if not place.is_level:
-        raise ValueError(f"{file}: the control points are on one line, or do not fit each other ({place.error:.3g} m)")
-    return place

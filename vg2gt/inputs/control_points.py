@@ -1,7 +1,8 @@
-"""Control points in OpenDroneMap's format: places on the Earth, and the pixels of photographs in which they are seen.
+"""Control points: in OpenDroneMap's format, with the pixels of photographs that show them, or as a CSV.
 
-The first line is the projection (``EPSG:4326``, ``EPSG:32632``, ``WGS84 UTM 32N``, ``+proj=utm +zone=32``), each other
-one ``x y z pixel_x pixel_y image [name]``; longitude comes before latitude. Lines of equal x, y and z are one point.
+The first line of OpenDroneMap's ``gcp_list.txt`` is the projection (``EPSG:4326``, ``EPSG:32632``, ``WGS84 UTM 32N``,
+``+proj=utm +zone=32``), each other one ``x y z pixel_x pixel_y image [name]``; longitude comes before latitude. Lines of
+equal x, y and z are one point.
 """
 
 from __future__ import annotations
@@ -69,6 +70,28 @@ def read_control_points(file: Path) -> list[ControlPoint]:
             points[x, y, z] = ControlPoint(name, np.array([latitude, longitude, z]), {})
         points[x, y, z].pixels[fields[5]] = (pixel[0], pixel[1])
     return list(points.values())
+
+
+def place_of_csv(file: Path) -> Place:
+    """Returns the place that control points in a scene's own frame give.
+
+    Args:
+        file: three or more lines ``x,y,z,latitude,longitude,altitude``, in scene units, degrees and metres.
+
+    Raises:
+        ValueError: if a line is wrong, or the points are on one line or do not fit each other.
+    """
+    expected = f"{file}: expected three or more lines x,y,z,latitude,longitude,altitude"
+    try:
+        rows = np.loadtxt(file, delimiter=",", ndmin=2)
+    except ValueError as error:
+        raise ValueError(f"{expected} ({error})") from error
+    if rows.shape[1] != 6 or len(rows) < 3 or not np.isfinite(rows).all():
+        raise ValueError(f"{expected}, got {len(rows)} of {rows.shape[1]} numbers")
+    place = place_of_points(rows[:, :3], rows[:, 3:])
+    if not place.is_level:
+        raise ValueError(f"{file}: the control points are on one line, or do not fit each other ({place.error:.3g} m)")
+    return place
 
 
 def _zone(utm: re.Match[str]) -> tuple[int, bool]:

@@ -28,13 +28,10 @@ log = logging.getLogger(__name__)
 _VERSIONS = 4  # of a photograph in a folder at most; more files of related names are a sequence
 _SIDE, _SAME = 64, 0.985  # of reduced images, and least correlation of versions: those reduced to a half have .992 and
 # more, views next to each other .981 at most (fox, bananas, monstree, a room)
-_BLOCK, _FLAT, _FITS, _MOST = (
-    20,
-    2.0,
-    0.8,
-    0.9,
-)  # pixels of a block, least detail (values of 255) and correlation of its
-# fine detail, share of such blocks: 96 % and more after changes of colour, 28 % if shifted by 1/400 of the width
+_BLOCK, _FLAT = 20, 2.0  # pixels of a block, and its least detail (values of 255)
+# Correlation of a block's fine detail, and share of such blocks, from which two photographs are copies: 96 % and more
+# after changes of colour, 28 % if shifted by 1/400 of the width.
+_FITS, _MOST = 0.8, 0.9
 
 
 def with_unique_names(pictures: Sequence[Picture]) -> list[Picture]:

@@ -45,7 +45,7 @@ class NeighborTable:
         targets: ``[T, P + 1]`` rows of the voxels that have these neighbours, padded with M.
         slots: ``[M, T + 1]`` index of a voxel's neighbour in ``sources.flatten()``; without one, the last of its row.
             The last column is that of the voxels themselves, which follow the neighbours.
-        back: ``[M, T + 1]`` index in ``targets.flatten()`` of the voxel whose neighbour a voxel is; likewise.
+        back: ``[M, T + 1]`` index in ``targets.flatten()`` of the voxel whose neighbour a voxel is, as in ``slots``.
         bags: ``[M]`` first index of each voxel in ``slots.flatten()``.
     """
 
