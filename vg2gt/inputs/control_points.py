@@ -1,8 +1,8 @@
 """Control points: in OpenDroneMap's format, with the pixels of photographs that show them, or as a CSV.
 
 The first line of OpenDroneMap's ``gcp_list.txt`` is the projection (``EPSG:4326``, ``EPSG:32632``, ``WGS84 UTM 32N``,
-``+proj=utm +zone=32``), each other one ``x y z pixel_x pixel_y image [name]``; longitude comes before latitude. Lines of
-equal x, y and z are one point.
+``+proj=utm +zone=32``), each other one ``x y z pixel_x pixel_y image [name]``; longitude comes before latitude. Lines
+of equal x, y and z are one point.
 """
 
 from __future__ import annotations
