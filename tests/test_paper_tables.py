@@ -13,7 +13,12 @@ from vg2gt.studies.ablation import common_overrides
 
 PAGE = (ROOT / "docs" / "reference" / "paper-tables.md").read_text()
 OPTION = re.compile(r'"(--[a-z]+)"')
-COMMANDS = re.findall(r"`((?:vg2gt|python) [^`]+)`", PAGE)
+DATA = dict(re.findall(r"^\| ([\w ]+) \| `((?:--|evaluation)[^`]+)` \|$", PAGE, re.MULTILINE))
+ROWS = re.findall(r"^\| .+ \| ([^`|]+) \| `([^`]+)` \|$", PAGE, re.MULTILINE)  # to which words of DATA are added
+COMMANDS = [f"{command} {DATA[name]}" for names, command in ROWS for name in names.split(", ")]
+TRAIN = next(command for command in re.findall(r"`([^`]+)`", PAGE) if command.startswith("vg2gt train"))
+COMMANDS += [f"{TRAIN} {words}" for words in re.findall(r"^\| .+ \| `(name=[^`]+)` \|$", PAGE, re.MULTILINE)]
+COMMANDS += [c for c in re.findall(r"`((?:vg2gt|python) [^`]+)`", PAGE) if c not in dict(ROWS).values()]
 ELSEWHERE = {"AnySplat", "YoNoSplat", "FreeSplatter", "DepthSplat", "MVSplat", "VolSplat"}  # their own code and weights
 
 
@@ -53,7 +58,8 @@ def commands_of(table: str) -> set[tuple[str, str]]:
         cells = [cell.strip() for cell in line.strip("|").split("|")]
         label = cells[0] or label
         if line.startswith("|") and "`" in cells[-1]:
-            found |= {(plain(one), cells[1] if len(cells) == 3 else "") for one in label.split(", ")}
+            names = cells[1].split(", ") if len(cells) == 3 else [""]
+            found |= {(plain(one), name) for one in label.split(", ") for name in names}
     return found
 
 

@@ -96,7 +96,7 @@ def test_reports_say_it(written: Path, stated: Scene, scene: Scene) -> None:
     confirmed, *_, error = trust_lines(stated)
     assert confirmed.startswith(f"Gaussians: {agreed:.0f} % are confirmed by two or more views; ")
     assert f"; {single:.0f} % were seen by one view only (single)" in confirmed
-    assert error == "depth: for half of the pixels, the error stays below 1 % in 9 of 10 cases"
+    assert error == "depth error of a typical pixel: at most 1 % (such limits hold for 9 of 10 pixels)"
     assert "no calibration" in trust_lines(scene)[-1]
     lonely = replace(stated, support=torch.full_like(stated.support, Status.SINGLE))
     lonely.__dict__["gaussian_trust"] = {"support": torch.full((len(stated.gaussians),), Status.SINGLE)}

@@ -131,9 +131,12 @@ def trust_lines(scene: Scene) -> list[str]:
         lines.append(f"few views agree: take more photographs in smaller steps{_GIVEN if given else ''}")
     if "error_of_pixels" not in figures:
         return [*lines, "depth errors are not stated: there is no calibration of this model (vg2gt calibrate)"]
-    when = "depth before refinement" if scene.refined is not None else "depth"
+    when = " before refinement" if scene.refined is not None else ""
     error, sure = 100 * figures["error_of_pixels"], round(10 * STATED)
-    return [*lines, f"{when}: for half of the pixels, the error stays below {error:.2g} % in {sure} of 10 cases"]
+    return [
+        *lines,
+        f"depth error of a typical pixel{when}: at most {error:.2g} % (such limits hold for {sure} of 10 pixels)",
+    ]
 
 
 def trust_picture(error: Tensor | None, support: Tensor) -> Tensor:
