@@ -175,7 +175,7 @@ def test_errors_are_stated_and_the_scene_is_refined_by_its_kind(recording: Path,
 def test_wrong_options_of_a_refinement_end_before_any_work(
     wrong: dict, said: str, recording: Path, monkeypatch
 ) -> None:
-    monkeypatch.setattr("vg2gt.api.reconstruct_with", lambda *_, **__: pytest.fail("reconstructed"))
+    monkeypatch.setattr("vg2gt.reconstruction.pipeline.reconstruct_with", lambda *_, **__: pytest.fail("reconstructed"))
     with pytest.raises(ValueError, match=said):
         vg2gt.load(device="cpu").reconstruct(recording, **wrong)
 
@@ -183,7 +183,7 @@ def test_wrong_options_of_a_refinement_end_before_any_work(
 def test_full_memory_of_a_refinement_names_what_takes_less(scene: vg2gt.Scene, monkeypatch) -> None:
     monkeypatch.setattr(refined, "refine_scene", lambda *_: torch.empty(1 << 60))
     with pytest.raises(OutOfMemory, match=r"4 images of 84x112.*refine\.full\.size"):
-        vg2gt.api.refined(scene, True, "normal", ())
+        refined.refined_by_policy(scene, True)
 
 
 @pytest.mark.parametrize("error", [torch.OutOfMemoryError("CUDA out of memory"), MemoryError("no more")])

@@ -18,11 +18,12 @@ from vg2gt.cli import render as render_command
 from vg2gt.inputs.camera_files import read_cameras
 from vg2gt.inputs.cameras import pictures_for
 from vg2gt.inputs.given_cameras import given_pictures
-from vg2gt.inputs.inputs import load_views, working_order, working_size
+from vg2gt.inputs.inputs import load_views, working_size
 from vg2gt.inputs.padding import padded
 from vg2gt.inputs.pictures import find_pictures
 from vg2gt.monitor import Monitor
 from vg2gt.outputs.saved import read_scene
+from vg2gt.reconstruction.order import working_order
 from vg2gt.reconstruction.pipeline import reconstruct_with
 from vg2gt.rendering import Renderer
 from vg2gt.runs.load import load_model

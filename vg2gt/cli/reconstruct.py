@@ -29,8 +29,8 @@ KEY=VALUE sets model, backend, renderer and refinement: backend=da3_small,
 model.fine.max_voxels=500000, refine.full.size=1008"""
 
 if TYPE_CHECKING:
-    from vg2gt.api import Pipeline
     from vg2gt.monitor import Monitor
+    from vg2gt.reconstruction.pipeline import Pipeline
     from vg2gt.reconstruction.scene import Scene
 
 
@@ -88,12 +88,13 @@ def _parser() -> argparse.ArgumentParser:
 
 def run(options: argparse.Namespace, overrides: Sequence[str]) -> Scene:
     """Reconstructs a scene, writes the outputs and returns it."""
-    from vg2gt.api import check_refinement, load
+    from vg2gt.api import load
     from vg2gt.io.gaussian_files import READERS
     from vg2gt.memory import RECONSTRUCTION, memory_advice
     from vg2gt.monitor import Monitor
     from vg2gt.outputs.outputs import cost_figures, write_outputs
     from vg2gt.reconstruction.frame import place_lines
+    from vg2gt.reconstruction.policy import check_refinement
     from vg2gt.reconstruction.refined import refinement_lines
     from vg2gt.reconstruction.trust import trust_lines, trusted
     from vg2gt.reconstruction.windows.store import remove

@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn import functional as F
 
 from vg2gt.data.base import Frames
-from vg2gt.data.transforms import resize_to_cover, to_bytes
+from vg2gt.data.transforms import resize_to_cover
 from vg2gt.geometry.cameras import crop_intrinsics, resize_intrinsics
 from vg2gt.inputs.pictures import Picture
 from vg2gt.io.cameras_json import NamedCamera, Photo
 from vg2gt.monitor import Monitor
-from vg2gt.types import Cameras, Geometry, Hints
+from vg2gt.types import Cameras, Hints
 
 LONGER_SIDE = {"cuda": 518, "cpu": 280}  # pixels, by device; foundation models are trained at about 518
-_THUMBNAIL = 24  # pixels per side
 _FEWEST_POINTS = 20  # minimum observations of sparse points for a depth range
 _OUTLIERS, _NEARER, _FARTHER = 1, 0.8, 1.4  # percent cut at either end, widening factors
 
@@ -168,39 +165,3 @@ def depth_range(pictures: Sequence[Picture]) -> Tensor | None:
         return None
     near, far = np.percentile(depths, (_OUTLIERS, 100 - _OUTLIERS))
     return torch.tensor([[near * _NEARER, far * _FARTHER]], dtype=torch.float32)
-
-
-def working_order(images: Tensor) -> list[int]:
-    """Returns the indices of views ``[V, 3, H, W]`` in processing order.
-
-    The first view defines the scene's frame: it is the one that looks most like the others, by the correlation of
-    thumbnails. The others are sorted by a hash of their contents.
-    """
-    contents = [hashlib.sha256(to_bytes(image).numpy().tobytes()).hexdigest() for image in images]
-    order = sorted(range(len(contents)), key=lambda view: contents[view])
-    unit = thumbnails(images)[order]
-    reference = int((unit @ unit.mean(0)).argmax())
-    return [order[reference], *(view for place, view in enumerate(order) if place != reference)]
-
-
-def thumbnails(images: Tensor) -> Tensor:
-    """Returns small grey images ``[V, 576]`` of zero mean and unit length, float64: their products are correlations."""
-    gray = (image[None].mean(1, keepdim=True) for image in images)  # one by one, to bound memory
-    small = torch.cat([F.interpolate(image, (_THUMBNAIL, _THUMBNAIL), mode="area").flatten(1) for image in gray])
-    return F.normalize(small.double() - small.double().mean(1, keepdim=True), dim=1)
-
-
-def in_order(views: Views, order: Sequence[int]) -> tuple[Tensor, Hints]:
-    """Returns images ``[V, 3, H, W]`` and hints of the views in another order."""
-    hints = views.hints
-    cameras = None if hints.cameras is None else hints.cameras.select(torch.tensor(order))
-    parts = {name: getattr(hints, name) for name in ("depth", "frame_ids", "mask")}
-    chosen = {name: None if value is None else value[:, list(order)] for name, value in parts.items()}
-    return views.images[list(order)], replace(hints, cameras=cameras, **chosen)
-
-
-def as_given(geometry: Geometry, order: Sequence[int]) -> Geometry:
-    """Reorders geometry from processing order to the order in which the views were given."""
-    back = torch.tensor(order).argsort()
-    cameras: Cameras = geometry.cameras.select(back.to(geometry.depth.device))
-    return replace(geometry, depth=geometry.depth[:, back], depth_conf=geometry.depth_conf[:, back], cameras=cameras)

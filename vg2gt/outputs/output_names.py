@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 FPS = 24.0
-SFM = "sfm"  # subfolder of the output folder for cameras found by structure from motion
 
 MAPS = {
     "color.png": "rendered colour, a PNG per view in color/",

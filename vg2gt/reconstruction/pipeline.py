@@ -1,10 +1,12 @@
-"""From images to a scene in one call."""
+"""From images to a scene: cameras, forward pass, frame, refinement."""
 
 from __future__ import annotations
 
 import logging
+import sys
 from collections.abc import Sequence
-from dataclasses import replace
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
@@ -19,7 +21,7 @@ from vg2gt.geometry.precision import half_precision_on_gpu
 from vg2gt.inputs.camera_source import CameraSource
 from vg2gt.inputs.cameras import Poses, pictures_for
 from vg2gt.inputs.folders import is_photo
-from vg2gt.inputs.inputs import Views, as_given, in_order, load_views, working_order, working_size
+from vg2gt.inputs.inputs import Views, load_views, working_size
 from vg2gt.inputs.padding import padded
 from vg2gt.inputs.pictures import ImagesLike, Picture
 from vg2gt.io.image_files import gps_position
@@ -27,16 +29,86 @@ from vg2gt.memory import RECONSTRUCTION, memory_advice, note_sizes
 from vg2gt.model import Reconstructor
 from vg2gt.monitor import Monitor
 from vg2gt.reconstruction.frame import SceneFrame, first_frame
+from vg2gt.reconstruction.order import as_given, in_order, working_order
+from vg2gt.reconstruction.policy import Quality, Refinement, check_refinement
+from vg2gt.reconstruction.refined import refined_by_policy
 from vg2gt.reconstruction.scene import Scene
 from vg2gt.reconstruction.surroundings import with_surroundings
 from vg2gt.reconstruction.trust import pixel_trust
+from vg2gt.reconstruction.windows import WINDOWS
 from vg2gt.reconstruction.windows.run import WindowRun, device_of, window_model
 from vg2gt.reconstruction.windows.store import window_size
 from vg2gt.rendering import Renderer
+from vg2gt.runs.load import LoadedModel
 from vg2gt.types import Cameras, Gaussians, Geometry
 from vg2gt.uncertainty import Calibration
 
 log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Pipeline(LoadedModel):
+    """A loaded model that reconstructs scenes with the renderer of its run and its calibration."""
+
+    def reconstruct(
+        self,
+        images: ImagesLike,
+        *,
+        size: int | tuple[int, int] | None = None,
+        quality: Quality = "normal",
+        refine: Refinement = None,
+        overrides: Sequence[str] = (),
+        max_images: int | None = None,
+        poses: Poses = "auto",
+        window: int | None = None,
+        folder: str | Path | None = None,
+        monitor: Monitor | None = None,
+    ) -> Scene:
+        """Turns images into a scene, as ``vg2gt reconstruct`` does.
+
+        Args:
+            images: paths, a folder, a video, a recording, or images in memory
+                (:func:`vg2gt.inputs.pictures.find_pictures`).
+            size: longer side of the images in the model in pixels, or height and width; None: 518, on a CPU 280.
+            quality: how long photographs are refined (:func:`vg2gt.reconstruction.policy.refinement_for`).
+            refine: whether the scene is then refined on its images; a number of steps refines at the working size
+                only. None: up to 100 photographs are refined, RGB-D recordings are not.
+            overrides: options of the refinement, ``refine.key=value``.
+            max_images: maximum number of images, evenly spread; None: all, 32 of a video.
+            poses: where the cameras come from (:func:`vg2gt.inputs.cameras.pictures_for`).
+            window: number of images that are processed at a time; 0: all at once; None: 24 if there are more than 100.
+            folder: where cameras from structure from motion and finished windows are kept, so that the next call
+                reuses them; None: nowhere.
+            monitor: shows and times the stages; None: progress bars if the standard error stream is a terminal.
+
+        Returns:
+            The scene in the frame of given cameras, else upright. Its Gaussians are on the model's device.
+
+        Raises:
+            FileNotFoundError: if a path does not exist.
+            ImportError: if cameras must be found and pycolmap is not installed.
+            ValueError: if the images cannot be used, or an option is unknown.
+            OutOfMemory: if the device's memory is full.
+        """
+        check_refinement(refine, quality, overrides)
+        kept = None if folder is None else Path(folder)
+        with ExitStack() as stack:
+            if monitor is None:
+                monitor = stack.enter_context(Monitor(sys.stderr.isatty(), device_of(self.model)))
+            scene = reconstruct_with(
+                self.model,
+                images,
+                max_images=max_images,
+                size=size,
+                renderer=self.renderer,
+                monitor=monitor,
+                poses=poses,
+                sfm_folder=kept and kept / "sfm",
+                window=window,
+                window_folder=kept and kept / WINDOWS,
+                calibration=self.calibration,
+            )
+            return refined_by_policy(scene, refine, quality, overrides, monitor)
 
 
 @torch.no_grad()
@@ -54,32 +126,11 @@ def reconstruct_with(
     window_folder: str | Path | None = None,
     calibration: Calibration | None = None,
 ) -> Scene:
-    """Reconstructs a scene from any number of images, feed-forward; :mod:`vg2gt.api` then refines it.
+    """Reconstructs a scene from images, feed-forward; arguments and errors are those of :meth:`Pipeline.reconstruct`.
 
-    Args:
-        model: the model; it is put into eval mode.
-        images: see :func:`vg2gt.inputs.pictures.find_pictures`.
-        max_images: maximum number of images, evenly spread.
-        size: see :func:`vg2gt.inputs.inputs.working_size`.
-        renderer: renderer of the scene; None: solids, with the default options.
-        monitor: shows and times the stages.
-        poses: source of the cameras, see :func:`vg2gt.inputs.cameras.pictures_for`.
-        sfm_folder: folder where cameras found by structure from motion are kept and reused; None: they are not kept.
-        window: process this many images and their neighbours at a time, which bounds memory
-            (:mod:`vg2gt.reconstruction.windows`); 0: all at once; None: 24 if there are more than 100, else all.
-        window_folder: folder for finished windows, from which an interrupted reconstruction resumes; None: a temporary
-            one.
-        calibration: calibration of the model, from which errors are stated; None: no stated errors.
-
-    Returns:
-        The scene in the frame of given cameras, else upright; its Gaussians stay on the model's device. For a scene
-        made in windows, images, depth and stated errors are memory-mapped.
-
-    Raises:
-        FileNotFoundError: if a path does not exist.
-        ImportError: if cameras must be found and pycolmap is not installed.
-        ValueError: if there are no images, one cannot be read, or they lack what the backend needs.
-        OutOfMemory: if the device's memory is full.
+    The model is put into eval mode. Without a renderer, solids are rendered, without a calibration, no errors are
+    stated. ``sfm_folder`` and ``window_folder`` keep what the next call can use; None: nothing is kept. If the scene is
+    made in windows, its images, depth and stated errors are memory-mapped.
     """
     monitor = monitor or Monitor()
     chosen = pictures_for(model, images, poses, max_images=max_images, sfm_folder=sfm_folder, monitor=monitor)

@@ -82,6 +82,18 @@ def chosen_refinement(
     return replace(refinement_for(scene, quality, overrides, steps=refine), full=None) if refine else None
 
 
+def check_refinement(refine: Refinement, quality: Quality, overrides: Sequence[str]) -> None:
+    """Checks the options of a refinement (:func:`chosen_refinement`) before any work is done.
+
+    Raises:
+        ValueError: if a name or a value is unknown or out of range; the message names it.
+    """
+    check_choice("quality", quality, Quality)
+    options = read_options("photographs", overrides)
+    if isinstance(refine, int) and refine:
+        replace(options, steps=int(refine))  # checks the range
+
+
 def read_options(name: str, overrides: Sequence[str]) -> RefineOptions:
     """Builds the options of ``refine=NAME refine.key=value``; ``name`` is used if the overrides choose none."""
     first = [] if _choose_config(overrides) else [f"refine={name}"]

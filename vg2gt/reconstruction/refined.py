@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from vg2gt.memory import RECONSTRUCTION, memory_advice, note_sizes
 from vg2gt.monitor import Monitor
 from vg2gt.reconstruction.photographs import full_size, load_photographs, sparse_points
 from vg2gt.reconstruction.policy import Quality, Refinement, chosen_refinement
@@ -106,9 +107,18 @@ def refined_by_policy(
     overrides: Sequence[str] = (),
     monitor: Monitor | None = None,
 ) -> Scene:
-    """Refines a scene if :func:`vg2gt.reconstruction.policy.chosen_refinement` says so; arguments as there."""
+    """Refines a scene if :func:`vg2gt.reconstruction.policy.chosen_refinement` says so; arguments as there.
+
+    Raises:
+        OutOfMemory: if the device's memory is full; the message says what takes less.
+    """
     options = chosen_refinement(scene, refine, quality, overrides)
-    return scene if options is None else refine_scene(scene, options, monitor)
+    if options is None:
+        return scene
+    height, width = scene.cameras.size
+    with memory_advice(RECONSTRUCTION):
+        note_sizes({f"images of {height}x{width}": len(scene.names), "Gaussians": len(scene.gaussians)})
+        return refine_scene(scene, options, monitor)
 
 
 def _shown(advance: Callable[..., None], monitor: Monitor) -> Observer:

@@ -11,11 +11,11 @@ from torch import Tensor
 
 from vg2gt.geometry.cameras import scale_translations, strided_intrinsics
 from vg2gt.geometry.precision import half_precision_on_gpu
-from vg2gt.inputs.inputs import thumbnails, working_order
 from vg2gt.inputs.pictures import Picture
 from vg2gt.method.pooled import PooledVoxels
 from vg2gt.model import VG2GT, Reconstructor, background_sums
 from vg2gt.monitor import Monitor
+from vg2gt.reconstruction.order import thumbnails, working_order
 from vg2gt.reconstruction.windows.placement import (
     Found,
     closes,
