@@ -17,13 +17,12 @@ from pathlib import Path
 import numpy as np
 import torch
 from common import machine, parser, write_results
-from PIL import Image
 
+from examples.write_recordings import write_recording
 from vg2gt.data import RGBDFolder, SceneSource
 from vg2gt.data.sources import Streamed
 from vg2gt.data.sources.streamed import write_stream
 from vg2gt.data.transforms import resize_to_cover
-from vg2gt.geometry.cameras import invert_rigid
 
 GROUP, ROUNDS = 8, 5
 
@@ -32,18 +31,7 @@ def write_folder(recording: str, folder: Path) -> RGBDFolder:
     """Writes a recording as ``images/ depth/ poses.txt K.txt``, all images PNG; returns it."""
     source = RGBDFolder(recording, holdout=None)
     scene = source.scenes[0]
-    poses = []
-    for name in ("images", "depth"):
-        (folder / "scene" / name).mkdir(parents=True)
-    for frame in source.frames(scene):
-        frames = source.load(scene, [frame])
-        color = (frames.images[0].permute(1, 2, 0) * 255).round().to(torch.uint8).numpy()
-        depth = (frames.depth[0] * 1000).round().numpy().astype(np.uint16)
-        for name, image in (("images", color), ("depth", depth)):
-            Image.fromarray(image).save(folder / "scene" / name / f"{frame:06d}.png")
-        poses.append(invert_rigid(frames.world_to_camera)[0].numpy().reshape(16))
-        np.savetxt(folder / "scene" / "K.txt", frames.intrinsics[0].numpy())
-    np.savetxt(folder / "scene" / "poses.txt", poses)
+    write_recording(folder / "scene", source.load(scene, source.frames(scene)))
     return RGBDFolder(str(folder / "scene"), holdout=None)
 
 

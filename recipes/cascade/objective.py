@@ -10,7 +10,7 @@ from backends.cascade.network import PLANES, ROWS, CascadeEncoding
 from backends.cascade.planes import Planes, baselines
 from backends.sweep.network import Sweep
 from recipes.cascade.samples import Sample
-from recipes.sweep.objective import cell_inverse
+from recipes.sweep.objective import cell_inverse, gradient, mean
 
 _CLAMP, _SLOPE = 2.0, 0.2  # log-depth errors above this count by the slope only
 _BEYOND = 1.5 / (PLANES - 1)  # position from which on any greater depth counts as correct, as for sky
@@ -50,9 +50,9 @@ def objective(
     valid = known * ~beyond
     log_scale = log_scale.clamp(-6, 1)
     terms = {
-        "depth": _mean(_limited(error), known * sample.weight),
-        "uncertainty": _mean(stated * torch.exp(-log_scale) + log_scale, known),
-        "gradient": sum((_gradient(error[:, ::k, ::k], valid[:, ::k, ::k]) for k in (1, 2, 4)), torch.zeros(())),
+        "depth": mean(_limited(error), known * sample.weight),
+        "uncertainty": mean(stated * torch.exp(-log_scale) + log_scale, known),
+        "gradient": sum((gradient(error[:, ::k, ::k], valid[:, ::k, ::k]) for k in (1, 2, 4)), torch.zeros(())),
     }
     sums: dict[str, list[Tensor]] = {"planes": [], "stages": [], "centers": [], "guess": []}
     for stage, center, cell, rows in zip(encoding.stages, encoding.centers, (8, 4, 2), ROWS, strict=True):
@@ -64,7 +64,7 @@ def objective(
         looked = {"stages": found, "centers": center} | ({"guess": encoding.guess} if cell == 8 else {})
         for name, log_depth in looked.items():
             off = _limited(_log_error(log_depth, truth, farthest)[0])
-            sums[name].append(_mean(off, seen if name == "stages" else weight))
+            sums[name].append(mean(off, seen if name == "stages" else weight))
     terms |= {name: torch.stack(values).sum() for name, values in sums.items()}
     return torch.stack([WEIGHTS[name] * term for name, term in terms.items()]).sum(), terms
 
@@ -81,17 +81,6 @@ def _log_error(log_depth: Tensor, truth: Tensor, farthest: Tensor) -> tuple[Tens
 def _limited(error: Tensor) -> Tensor:
     """Absolute error, less of what is gross; never flat, as planes reach to infinity."""
     return error.abs().clamp_max(_CLAMP) + _SLOPE * (error.abs() - _CLAMP).clamp_min(0)
-
-
-def _mean(values: Tensor, weights: Tensor) -> Tensor:
-    return (values * weights).sum() / weights.sum().clamp_min(1)
-
-
-def _gradient(error: Tensor, valid: Tensor) -> Tensor:
-    """Mean absolute difference between the errors of neighbouring pixels; invariant to the scale of depth."""
-    down = (error[:, 1:] - error[:, :-1]).abs().clamp_max(1) * valid[:, 1:] * valid[:, :-1]
-    right = (error[:, :, 1:] - error[:, :, :-1]).abs().clamp_max(1) * valid[:, :, 1:] * valid[:, :, :-1]
-    return down.mean() + right.mean()
 
 
 def plane_entropy(stage: Sweep, t: Tensor, known: Tensor, rows: int = 1) -> Tensor:

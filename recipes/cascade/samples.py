@@ -16,16 +16,11 @@ from torch.utils.data import Dataset
 from backends.cascade.planes import COARSE_SOURCES, coarse_sources
 from recipes.sweep import samples as views_of
 from recipes.sweep.scenes import read_scene
-from vg2gt.geometry.cameras import rigid_motions
 from vg2gt.metrics.kinds import pixel_kinds
 from vg2gt.types import Cameras
 
-_UPRIGHT_SHARE = 0.3  # of samples rotated by 90 degrees to portrait format
-_SOURCE_NOISE = 0.4  # on log-scores, so that training also sees pairs other than the best
 _FEWER_SHARE = 0.4  # of samples whose views have fewer sources than the network would take
-_POSE_SHARE, _TURN, _SHIFT = 0.5, 0.0015, 0.002  # share of samples with pose noise; rad; in depths
 _ORPHAN_SHARE = 0.2  # of samples in which views, or a region of them, are matched with no source
-_LEAST_PIXELS = 5000  # with known depth, of four views of 80x160; samples with fewer are drawn again
 _ALONE, _BARE = 1.0, 0.5  # added to the weight of pixels that no other view sees, and of those without texture
 
 
@@ -83,14 +78,14 @@ class CascadeSamples(Dataset[Sample]):
     def __getitem__(self, index: int) -> Sample:
         rng = np.random.default_rng((self.seed, index))
         count, size = self.shapes[rng.choice(len(self.shapes), p=self.shares)]
-        turns = int(rng.choice(4, p=(1 - _UPRIGHT_SHARE, _UPRIGHT_SHARE / 2, 0, _UPRIGHT_SHARE / 2)))
+        turns = views_of.draw_turns(rng)
         while True:
             files = self.more if self.share and rng.random() < self.share else self.files
             path = files[rng.integers(len(files))]
             views = views_of.choose_views(read_scene(path), count, self.any_views, rng)
             views = views_of.turn(views_of.crop(views, size, rng), 0 if self.plain else turns)
             valid = views.depth[(views.depth > 0) & views.depth.isfinite()]
-            if len(valid) >= _LEAST_PIXELS * views.depth.numel() / 51_200:
+            if len(valid) >= views_of.LEAST_PIXELS * views.depth.numel() / 51_200:
                 return self._finish(views, valid, rng)
 
     def _finish(self, views: views_of.Crop, valid: Tensor, rng: Generator) -> Sample:
@@ -106,14 +101,11 @@ class CascadeSamples(Dataset[Sample]):
         most, noise = min(COARSE_SOURCES, count - 1), None
         images = views.images
         if not self.plain:
-            if rng.random() < _POSE_SHARE:
-                low, middle = (float(unit * torch.quantile(valid[:: len(valid) // 4000 + 1], q)) for q in (0.01, 0.5))
-                turns = torch.from_numpy(rng.normal(0, _TURN, (count, 3))).float()
-                shifts = torch.from_numpy(rng.normal(0, _SHIFT * min(middle, 3 * low), (count, 3))).float()
-                poses = rigid_motions(turns, shifts) @ poses
+            low, middle = (float(unit * torch.quantile(valid[:: len(valid) // 4000 + 1], q)) for q in (0.01, 0.5))
+            poses = views_of.with_noise(poses, min(middle, 3 * low), rng)
             if most > 1 and rng.random() < _FEWER_SHARE:
                 most = int(rng.integers(1 if rng.random() < 0.3 else 2, most + 1))
-            noise = torch.from_numpy(rng.normal(0, _SOURCE_NOISE, (count, count))).float()
+            noise = torch.from_numpy(rng.normal(0, views_of.SOURCE_NOISE, (count, count))).float()
             if rng.random() < _ORPHAN_SHARE:
                 shown = _orphan(shown, rng)
             images = views_of.recolour(images, rng)

@@ -43,9 +43,9 @@ def objective(
     stated = torch.where(beyond, absolute.clamp_min(_BEYOND_ERROR), absolute)
     log_scale = log_scale.clamp(-6, 1)
     terms = {
-        "depth": _mean(absolute, seen),
-        "uncertainty": _mean(stated * torch.exp(-log_scale) + log_scale, seen),
-        "gradient": sum((_gradient(error[:, ::k, ::k], valid[:, ::k, ::k]) for k in (1, 2, 4)), torch.zeros(())),
+        "depth": mean(absolute, seen),
+        "uncertainty": mean(stated * torch.exp(-log_scale) + log_scale, seen),
+        "gradient": sum((gradient(error[:, ::k, ::k], valid[:, ::k, ::k]) for k in (1, 2, 4)), torch.zeros(())),
     }
     # both sweeps, at 1/4 and 1/2 of the image
     planes, positions = [], []
@@ -56,9 +56,9 @@ def objective(
         t = from_inverse(inverse, sample.depth_range)
         planes.append(_cross_entropy(sweep, t, known))
         for position in (sweep.t, encoding.refined if cell == 4 else encoding.center):
-            positions.append(_mean((position - t).abs().clamp_max(0.3), known))
+            positions.append(mean((position - t).abs().clamp_max(0.3), known))
         if cell == 2:
-            terms["swept"] = _mean((encoding.swept[:, :1] + inverse.log()).abs().clamp_max(_CLAMP), finite)
+            terms["swept"] = mean((encoding.swept[:, :1] + inverse.log()).abs().clamp_max(_CLAMP), finite)
     terms["planes"] = torch.stack(planes).sum()
     terms["position"] = torch.stack(positions).sum()
     return torch.stack([WEIGHTS[name] * term for name, term in terms.items()]).sum(), terms
@@ -79,12 +79,13 @@ def cell_inverse(depth: Tensor, cell: int) -> tuple[Tensor, Tensor]:
     return torch.where(known, inverse, 1.0), known.float()
 
 
-def _mean(values: Tensor, weights: Tensor) -> Tensor:
+def mean(values: Tensor, weights: Tensor) -> Tensor:
+    """Returns the weighted mean; weights that sum to less than 1 count as if they did to 1."""
     return (values * weights).sum() / weights.sum().clamp_min(1)
 
 
-def _gradient(error: Tensor, valid: Tensor) -> Tensor:
-    """Mean absolute difference between the errors of neighbouring pixels; invariant to the scale of depth."""
+def gradient(error: Tensor, valid: Tensor) -> Tensor:
+    """Returns the mean absolute difference of neighbouring errors; invariant to the scale of depth."""
     down = (error[:, 1:] - error[:, :-1]).abs().clamp_max(1) * valid[:, 1:] * valid[:, :-1]
     right = (error[:, :, 1:] - error[:, :, :-1]).abs().clamp_max(1) * valid[:, :, 1:] * valid[:, :, :-1]
     return down.mean() + right.mean()
@@ -104,4 +105,4 @@ def _cross_entropy(sweep: Sweep, t: Tensor, known: Tensor) -> Tensor:
     likely = F.log_softmax(sweep.logits, 1)
     low = low.long()
     entropy = -(likely.gather(1, low) * (1 - share) + likely.gather(1, low + 1) * share)
-    return _mean(entropy, known)
+    return mean(entropy, known)

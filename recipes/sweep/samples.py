@@ -30,9 +30,9 @@ _LEAST_OVERLAP = 0.15
 _WALK_FRAMES, _WALK_STEP = 14, math.radians(9)  # maximum frames and median rotation between frames of a walk
 _PLANES = (32, 48)  # few sizes, as convolutions on CPUs are compiled for each
 _SOURCES, _SOURCE_SHARES = (2, 3), (0.7, 0.3)
-_SOURCE_NOISE = 0.4  # on log-scores, so that training also sees pairs other than the best
+SOURCE_NOISE = 0.4  # on log-scores, so that training also sees pairs other than the best
 _POSE_SHARE, _TURN, _SHIFT = 0.5, 0.0015, 0.002  # share of samples with pose noise; rad; in depths
-_LEAST_PIXELS = 5000  # with known depth; samples with fewer are drawn again
+LEAST_PIXELS = 5000  # with known depth, of four views of 80x160; samples with fewer are drawn again
 _GREY_SHARE = 0.2
 
 
@@ -101,7 +101,7 @@ class TrainingSamples(Dataset[Sample]):
         rng = np.random.default_rng((self.seed, index))
         # equal for all scenes of a sample, so that they can be concatenated
         size = self.sizes[rng.choice(len(self.sizes), p=self.shares)]
-        turns = int(rng.choice(4, p=(1 - _UPRIGHT_SHARE, _UPRIGHT_SHARE / 2, 0, _UPRIGHT_SHARE / 2)))
+        turns = draw_turns(rng)
         planes, sources = int(rng.choice(_PLANES)), int(rng.choice(_SOURCES, p=_SOURCE_SHARES))
         parts = [self._scene(size, turns, sources, rng) for _ in range(self.scenes)]
         parts = [part._replace(sources=part.sources + n * self.views) for n, part in enumerate(parts)]
@@ -115,7 +115,7 @@ class TrainingSamples(Dataset[Sample]):
             views = choose_views(read_scene(path), self.views, self.any_views, rng)
             views = turn(crop(views, size, rng), turns)
             valid = views.depth[(views.depth > 0) & views.depth.isfinite()]
-            if len(valid) >= _LEAST_PIXELS:
+            if len(valid) >= LEAST_PIXELS:
                 return _finish(views, valid, _CUT_INDOORS if is_room(path) else _CUT, sources, rng)
 
 
@@ -196,6 +196,11 @@ def crop(views: Crop, target: tuple[int, int], rng: Generator) -> Crop:
     return Crop(images.clamp(0, 1), depth, poses.clone(), intrinsics)
 
 
+def draw_turns(rng: Generator) -> int:
+    """Draws how often a sample is turned (:func:`turn`)."""
+    return int(rng.choice(4, p=(1 - _UPRIGHT_SHARE, _UPRIGHT_SHARE / 2, 0, _UPRIGHT_SHARE / 2)))
+
+
 def turn(views: Crop, turns: int) -> Crop:
     """Rotates all views by 90 degrees to the left, ``turns`` times."""
     images, depth, poses, intrinsics = views
@@ -223,15 +228,21 @@ def _finish(views: Crop, valid: Tensor, cut: tuple[float, float], sources: int, 
         high = float(unit * torch.quantile(some, rng.uniform(*cut)))
     near = low * math.exp(-(rng.uniform(0.02, 0.5) if rng.random() < 0.75 else rng.uniform(0, 1.8)))
     far = high * math.exp(rng.uniform(0, 0.6) if rng.random() < 0.75 else rng.uniform(0, 2.5))
-    if rng.random() < _POSE_SHARE:
-        turns = torch.from_numpy(rng.normal(0, _TURN, (len(poses), 3))).float()
-        shifts = torch.from_numpy(rng.normal(0, _SHIFT * min(middle, 3 * low), (len(poses), 3))).float()
-        poses = rigid_motions(turns, shifts) @ poses
+    poses = with_noise(poses, min(middle, 3 * low), rng)
     depth_range, size = torch.tensor([near, far]), (depth.shape[-2], depth.shape[-1])
-    noise = torch.from_numpy(rng.normal(0, _SOURCE_NOISE, (len(poses), len(poses)))).float()
+    noise = torch.from_numpy(rng.normal(0, SOURCE_NOISE, (len(poses), len(poses)))).float()
     chosen = choose_sources(poses, views.intrinsics, size, depth_range, sources, noise)
     look = recolour(views.images, rng)
     return Sample(look, depth, poses, views.intrinsics, depth_range.expand(len(poses), 2), chosen)
+
+
+def with_noise(poses: Tensor, unit: float, rng: Generator) -> Tensor:
+    """Adds realistic noise to poses ``[V, 4, 4]`` in some samples; shifts are relative to ``unit``."""
+    if rng.random() >= _POSE_SHARE:
+        return poses
+    turns = torch.from_numpy(rng.normal(0, _TURN, (len(poses), 3))).float()
+    shifts = torch.from_numpy(rng.normal(0, _SHIFT * unit, (len(poses), 3))).float()
+    return rigid_motions(turns, shifts) @ poses
 
 
 def recolour(images: Tensor, rng: Generator) -> Tensor:

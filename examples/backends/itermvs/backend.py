@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from backends.base import Backend
-from backends.sweep.views import camera_distances, choose_sources
+from backends.sweep.views import agreed_range, choose_sources, wide_range
 from backends.weights import Weights
 from examples.backends.itermvs.matching import Projections
 from examples.backends.itermvs.network import HIDDEN, STRIDE, IterMVSNet
@@ -21,10 +21,7 @@ from vg2gt.types import Cameras, Geometry, Hints, Tokens
 _PATCH = 8
 _CELLS = _PATCH // STRIDE  # hidden states of a patch along each axis
 _LEAST_CONFIDENCE = 1e-6
-_WIDE = (0.1, 40.0)  # searched range, in units of the largest distance between cameras
-_NEAREST = 0.03  # smallest near of the search, in the same unit
 _CONFIDENT = 0.3  # confidence above which a pixel counts for the range
-_BEYOND = (0.8, 1.4)  # factors on the first and the last percentile of confident depth
 
 
 class IterMVSBackend(Backend):
@@ -90,19 +87,11 @@ class IterMVSBackend(Backend):
             images: ``[V, 3, H, W]`` in [-1, 1].
             cameras: cameras of this scene (B = 1).
         """
-        distances = camera_distances(cameras.world_to_camera[0])
-        extent = distances.max()
-        step = distances.fill_diagonal_(torch.inf).min(1).values.median()
-        near = torch.minimum(_WIDE[0] * extent, step.clamp_min(_NEAREST * extent))
-        wide = torch.stack((near, _WIDE[1] * extent))
+        wide = wide_range(cameras.world_to_camera[0])
         small = F.avg_pool2d(F.pad(images, (0, images.shape[-1] % 16, 0, images.shape[-2] % 16), mode="replicate"), 2)
         half = replace(cameras, intrinsics=resize_intrinsics(cameras.intrinsics, 0.5, 0.5))
         depth, confidence = self.network.decode(*self._match(small, half, wide), wide)
-        counted = depth[confidence > _CONFIDENT].sort().values
-        if len(counted) < 0.01 * depth.numel():
-            return wide
-        ends = counted[[int(0.01 * len(counted)), int(0.99 * len(counted))]]
-        return ends * ends.new_tensor(_BEYOND)
+        return agreed_range(depth, (confidence > _CONFIDENT).float(), wide)
 
     def _match(self, images: Tensor, cameras: Cameras, depth_range: Tensor) -> tuple[Tensor, Tensor]:
         """Returns hidden states ``[V, HIDDEN, h, w]`` and features for the upsampling ``[V, 32, h, w]``."""
