@@ -111,7 +111,6 @@ class Batch(TensorRecord):
         images: ``[B, V, 3, H, W]`` in [0, 1].
         depth: ``[B, V, H, W]`` z-depth in the data's unit, 0 = invalid.
         cameras: ground-truth cameras, world frame of the data.
-        is_metric: ``[B]`` bool, True where the data's unit is the metre.
         frame_ids: ``[B, V]`` int64.
         scene: one name per scene.
         num_context: number of input views, 1 <= num_context <= V.
@@ -121,7 +120,6 @@ class Batch(TensorRecord):
     images: Tensor
     depth: Tensor
     cameras: Cameras
-    is_metric: Tensor
     frame_ids: Tensor
     scene: tuple[str, ...]
     num_context: int

@@ -147,8 +147,7 @@ def unseen_room() -> Batch:
     """Eight views of a room that neither the backbone nor anything else was trained on."""
     frames = SyntheticScenes(1, 1_500_001, num_frames=16).load("room-1500001", range(0, 16, 2))
     cameras = Cameras(frames.world_to_camera[None], frames.intrinsics[None], (112, 224))
-    metric, ids = torch.ones(1, dtype=torch.bool), torch.arange(8)[None]
-    return Batch(frames.images[None], frames.depth[None], cameras, metric, ids, ("room-1500001",), 8)
+    return Batch(frames.images[None], frames.depth[None], cameras, torch.arange(8)[None], ("room-1500001",), 8)
 
 
 def test_shipped_weights_measure_depth(unseen_room: Batch) -> None:

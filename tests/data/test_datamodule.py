@@ -24,7 +24,6 @@ def test_training_batches(rooms):
         assert scenes == len(batch.scene) == 4 // batch.num_context
         assert (views, batch.images.shape) == (batch.num_context + 1, (scenes, views, 3, *SIZE))
         assert (batch.depth.shape, batch.cameras.size) == ((scenes, views, *SIZE), SIZE)
-        assert batch.is_metric.tolist() == [True] * scenes
         direct = rooms.load(batch.scene[0], batch.frame_ids[0].tolist())
         torch.testing.assert_close(batch.images[0], direct.images, atol=1e-6, rtol=0)
         assert torch.equal(batch.depth[0], direct.depth)

@@ -82,7 +82,6 @@ def make_sample(
         images,
         depth,
         cameras,
-        torch.ones(scenes, dtype=torch.bool),
         torch.arange(views).repeat(scenes, 1),
         tuple(f"scene_{i}" for i in range(scenes)),
         num_context,

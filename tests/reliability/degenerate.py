@@ -130,7 +130,7 @@ def beside(good: Batch, other: Batch) -> Batch:
 
     both_cameras = [both(name, good.cameras, other.cameras) for name in ("world_to_camera", "intrinsics")]
     cameras = Cameras(both_cameras[0], both_cameras[1], good.cameras.size)
-    tensors = {name: both(name) for name in ("images", "depth", "is_metric", "frame_ids")}
+    tensors = {name: both(name) for name in ("images", "depth", "frame_ids")}
     return Batch(**tensors, cameras=cameras, scene=(*good.scene, *other.scene), num_context=good.num_context)
 
 

@@ -25,7 +25,7 @@ def room(number: int, views: int) -> Batch:
     frames = source.load(source.scenes[0], range(0, 2 * views, 2))
     cameras = Cameras(frames.world_to_camera[None], frames.intrinsics[None], SIZE)
     ids = torch.arange(views)[None]
-    return Batch(frames.images[None], frames.depth[None], cameras, torch.tensor([True]), ids, source.scenes, views)
+    return Batch(frames.images[None], frames.depth[None], cameras, ids, source.scenes, views)
 
 
 def measured(model: LoadedModel, rooms: int, views: int, noisy: float = 0.25) -> dict[str, float]:

@@ -90,10 +90,6 @@ class SceneSource(ABC):
         """
         return scene
 
-    def scene_is_metric(self, scene: str) -> bool:
-        """Whether this scene is in metres."""
-        return self.is_metric
-
     def parts(self) -> Mapping[str, float]:
         """Sampling weight in training of every group of scenes (``part``); a single group by default."""
         return {"": 1.0}

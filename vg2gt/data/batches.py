@@ -95,7 +95,6 @@ class BatchDataset(Dataset[Batch]):
             images=stack("images"),
             depth=depth,
             cameras=Cameras(stack("world_to_camera"), stack("intrinsics"), (depth.shape[-2], depth.shape[-1])),
-            is_metric=torch.tensor([self.source.scene_is_metric(view.scene) for view in views]),
             frame_ids=torch.tensor([ids for _, ids in loaded], dtype=torch.int64),
             scene=tuple(view.scene for view in views),
             num_context=len(views[0].context),

@@ -64,11 +64,6 @@ class Mixture(SceneSource):
         source, name = self._find(scene)
         return f"{self.part(scene)}/{source.place(name)}"
 
-    def scene_is_metric(self, scene: str) -> bool:
-        """Whether this scene is in metres."""
-        source, name = self._find(scene)
-        return source.scene_is_metric(name)
-
     def parts(self) -> Mapping[str, float]:
         """Returns the weights of the parts."""
         return self.weights

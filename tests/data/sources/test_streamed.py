@@ -50,7 +50,7 @@ def assert_equal(found: list[Batch], expected: list[Batch]) -> None:
     assert len(found) == len(expected) > 0
     for one, other in zip(found, expected, strict=True):
         assert one.scene == other.scene
-        for name in ("images", "depth", "frame_ids", "is_metric"):
+        for name in ("images", "depth", "frame_ids"):
             assert torch.equal(getattr(one, name), getattr(other, name)), name
         assert torch.equal(one.cameras.world_to_camera, other.cameras.world_to_camera)
         assert torch.equal(one.cameras.intrinsics, other.cameras.intrinsics)
@@ -63,7 +63,7 @@ def test_a_stream_is_the_folder_that_it_was_written_from(folders) -> None:
     for scene in source.scenes:
         assert list(stream.frames(scene)) == list(source.frames(scene))
         assert list(stream.held_out(scene)) == list(source.held_out(scene)) != []
-        for question in ("place", "part", "scene_is_metric"):
+        for question in ("place", "part"):
             assert getattr(stream, question)(scene) == getattr(source, question)(scene), question
     assert stream.parts() == source.parts()
     assert_equal(batches(stream, 0, 0, 1), batches(source, 0, 0, 1))

@@ -64,10 +64,6 @@ class Streamed(SceneSource):
         """Place that a scene shows."""
         return self._scenes[scene]["place"]
 
-    def scene_is_metric(self, scene: str) -> bool:
-        """Whether a scene is in metres."""
-        return self._scenes[scene]["is_metric"]
-
     def parts(self) -> dict[str, float]:
         """Sampling weight of every group of scenes."""
         return self._parts
@@ -151,7 +147,6 @@ class _Packer:
                 "held_out": list(source.held_out(scene)),
                 "place": source.place(scene),
                 "part": source.part(scene),
-                "is_metric": source.scene_is_metric(scene),
             }
             for scene in self.scenes
         }
