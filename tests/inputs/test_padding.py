@@ -13,8 +13,8 @@ from vg2gt import io
 from vg2gt.data.sources.sparse_points import ObservedPoints
 from vg2gt.geometry.cameras import project
 from vg2gt.inputs.given_cameras import given_pictures
-from vg2gt.inputs.inputs import load_views, photo_of, working_size
-from vg2gt.inputs.padding import PADDED, padded, without_padding
+from vg2gt.inputs.inputs import load_views, photo_of
+from vg2gt.inputs.padding import PADDED, of_one_shape, padded, without_padding
 from vg2gt.inputs.pictures import Picture
 from vg2gt.io.cameras_json import NamedCamera
 from vg2gt.monitor import Monitor
@@ -38,8 +38,7 @@ def mixed(folder: Path, frames) -> Path:
 
 def test_nothing_is_cropped_and_cameras_fit(mixed: Path, frames) -> None:
     pictures = given_pictures(mixed) or []
-    size = working_size([picture.size for picture in pictures], 14, "cpu")
-    whole = [padded(picture, size) for picture in pictures]
+    whole, size = of_one_shape(pictures, 14, "cpu")
     views = load_views(whole, size, Monitor())
     assert views.mask is not None
     for view, picture in enumerate(pictures):

@@ -18,8 +18,8 @@ from vg2gt.cli import render as render_command
 from vg2gt.inputs.camera_files import read_cameras
 from vg2gt.inputs.cameras import pictures_for
 from vg2gt.inputs.given_cameras import given_pictures
-from vg2gt.inputs.inputs import load_views, working_size
-from vg2gt.inputs.padding import padded
+from vg2gt.inputs.inputs import load_views
+from vg2gt.inputs.padding import of_one_shape
 from vg2gt.inputs.pictures import find_pictures
 from vg2gt.monitor import Monitor
 from vg2gt.outputs.saved import read_scene
@@ -49,9 +49,9 @@ def test_landscape_and_portrait_mixed_are_read_whole(folder: Path, frames, put) 
     pictures = given_pictures(folder)
     assert [picture.size for picture in pictures] == [SIZE] * 3 + [(112, 84)]
     assert pictures[3].read((112, 84)).images.shape[-2:] == (112, 84)
-    size = working_size([picture.size for picture in pictures], 14, "cpu")
+    shown, size = of_one_shape(pictures, 14, "cpu")
     assert size[0] / size[1] > 0.8  # as without cameras
-    assert load_views([padded(picture, size) for picture in pictures], size, Monitor()).images.shape[-2:] == size
+    assert load_views(shown, size, Monitor()).images.shape[-2:] == size
 
 
 @pytest.mark.parametrize("layout", ["reduced", "among", "other case", "any folder"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,11 +12,20 @@ from torch.nn import functional as F
 
 from vg2gt.data.base import Frames
 from vg2gt.geometry.cameras import crop_intrinsics
+from vg2gt.inputs.inputs import working_size
 from vg2gt.inputs.pictures import Picture
 
 PADDED = 1e-3
 """Mask of padding: hardly any weight, but unlike 0 it does not say that nothing is there (:func:`without_padding`)."""
 LEAST_KEPT = 0.8  # share of a picture's area; one that would lose more to cropping is padded
+
+
+def of_one_shape(
+    pictures: Sequence[Picture], patch: int, device: str, size: int | tuple[int, int] | None = None
+) -> tuple[list[Picture], tuple[int, int]]:
+    """Returns the pictures, padded where needed, and their working size (:func:`vg2gt.inputs.inputs.working_size`)."""
+    target = working_size([picture.size for picture in pictures], patch, device, size)
+    return [padded(picture, target) for picture in pictures], target
 
 
 def padded(picture: Picture, shape: tuple[int, int]) -> Picture:

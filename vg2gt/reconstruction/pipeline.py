@@ -21,8 +21,8 @@ from vg2gt.geometry.precision import half_precision_on_gpu
 from vg2gt.inputs.camera_source import CameraSource
 from vg2gt.inputs.cameras import Poses, pictures_for
 from vg2gt.inputs.folders import is_photo
-from vg2gt.inputs.inputs import Views, load_views, working_size
-from vg2gt.inputs.padding import padded
+from vg2gt.inputs.inputs import Views, load_views
+from vg2gt.inputs.padding import of_one_shape
 from vg2gt.inputs.pictures import ImagesLike, Picture
 from vg2gt.io.image_files import gps_position
 from vg2gt.memory import RECONSTRUCTION, memory_advice, note_sizes
@@ -135,9 +135,7 @@ def reconstruct_with(
     monitor = monitor or Monitor()
     chosen = pictures_for(model, images, poses, max_images=max_images, sfm_folder=sfm_folder, monitor=monitor)
     with memory_advice(RECONSTRUCTION), chosen as pictures:
-        sizes = [picture.size for picture in pictures]
-        target = working_size(sizes, model.backend.patch_size, device_of(model).type, size)
-        pictures = [padded(picture, target) for picture in pictures]
+        pictures, target = of_one_shape(pictures, model.backend.patch_size, device_of(model).type, size)
         note_sizes({f"images of {target[0]}x{target[1]}": len(pictures)})
         if images_at_a_time := window_size(window, len(pictures)):
             # memory-mapped files stay readable after their removal
