@@ -119,7 +119,9 @@ def test_photographs_at_their_own_size_are_those_of_the_views(
 
 
 def test_what_is_hardly_usable_is_said_with_its_causes() -> None:
-    assert _judged(24.04, 2) == "new views: about 24.0 dB (of 2 that were left out at first)"
+    assert (
+        _judged(24.04, 2) == "new views: PSNR of about 24.0 dB, measured on 2 photographs that were left out at first"
+    )
     assert "too far apart" in _judged(15.0, 1)
 
 

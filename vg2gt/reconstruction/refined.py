@@ -165,7 +165,8 @@ def _mean(psnr: Tensor) -> float:
 
 def _judged(psnr: float, views: int) -> str:
     """Says how good a scene is by the PSNR of views before they were trained, and what may be wrong if it is not."""
-    said = f"new views: about {psnr:.1f} dB (of {views} that were left out at first)"
+    which = "1 photograph that was" if views == 1 else f"{views} photographs that were"
+    said = f"new views: PSNR of about {psnr:.1f} dB, measured on {which} left out at first"
     if psnr >= USABLE:
         return said
     return (
