@@ -11,7 +11,7 @@ from tests.refinement.conftest import VIEWS, Start
 from vg2gt.geometry.cameras import invert_rigid
 from vg2gt.kernels.adam import RowUpdate, bias_corrections, update_rows, update_rows_reference
 from vg2gt.refinement import Observations, RefinedScene, RefineLoss, RefineRates
-from vg2gt.refinement.parameters import BETAS, EPSILON, Parameters
+from vg2gt.refinement.parameters import BETAS, EPSILON, LONGEST, Parameters
 from vg2gt.refinement.refine import ViewOrder, split_views
 
 PIXEL, DEPTH = 0.01, 2.0
@@ -62,6 +62,14 @@ def test_steps_are_in_units_of_each_gaussian_and_finite(parameters: Parameters) 
     assert parameters.step((scene.means * torch.randn_like(scene.means)).sum(), share=0.5)
     moved = (parameters.scene().gaussians.means.detach() - before).abs() / parameters.unit[:, None]
     torch.testing.assert_close(moved, torch.full_like(moved, 0.5 * RefineRates().means), rtol=0.05, atol=1e-3)
+
+
+def test_no_gaussian_becomes_a_stroke(parameters: Parameters) -> None:
+    for _ in range(200):
+        scales = parameters.scene().gaussians.scales
+        parameters.step(-scales[:, 0].log().sum() + scales[:, 1:].log().sum(), share=1.0)
+    scales = parameters.scene().gaussians.scales.detach()
+    torch.testing.assert_close(scales.max(-1).values, LONGEST * scales.median(-1).values)
 
 
 def test_what_is_transparent_is_removed_and_adam_keeps_what_it_knows_of_the_rest(parameters: Parameters) -> None:

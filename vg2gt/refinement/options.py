@@ -175,7 +175,7 @@ class RefineRates:
         quats: of the unit quaternions.
         scales: of the logarithm of the standard deviations.
         opacities: of the logit of the opacities.
-        sh: of the constant colour coefficient; the higher bands have a twentieth of it (as in 3DGS).
+        sh: of the constant colour coefficient; the higher bands have a fifth of it.
         cameras: of rotations and shifts, in pixels: a rotation by one pixel, or a shift that moves points at the median
             depth by one pixel.
         exposure: of each view's log gain and bias, one per colour channel. None: 0.004 if the views were exposed
@@ -211,7 +211,8 @@ class FullSizeOptions:
         crop: longest side of a crop in pixels.
         coarse: share of the stage, at its start, on photographs of half the size, of which a crop shows four times as
             much; only if they are much larger than the working size.
-        rate: factor on the rates of positions and colours.
+        rate: factor on the rates of positions and colours. Of five sets of photographs, one loses 0.2 dB at 0.25, and
+            one 2 dB at 1.
         max_gaussians: no Gaussian is split if there would be more.
         footprint: standard deviation in pixels above which a Gaussian is split.
         least: contribution below which a Gaussian is removed, in pixels of a view of 280.
@@ -231,7 +232,7 @@ class FullSizeOptions:
     """
 
     size: int = 1600
-    steps: int = 800
+    steps: int = 600
     renderings: float = 40.0
     crop: int = 320
     coarse: float = 0.5
