@@ -78,15 +78,39 @@ def test_a_signal_saves_without_another_evaluation(tmp_path: Path, cache: Path, 
     assert signal.getsignal(number) == before
 
 
-def test_a_signal_ends_an_evaluation_at_once(tmp_path: Path, cache: Path) -> None:
-    """Lightning's own handler would only record it."""
-    run, handlers = build(small_config(tmp_path, cache, *RUN)), []
+@pytest.mark.parametrize("moment", ["on_train_batch_start", "on_validation_start"])
+def test_a_signal_in_the_last_step_or_after_it_leaves_the_evaluation_to_the_next_run(tmp_path, cache, moment) -> None:
+    """``on_validation_start``: in the evaluation that belongs to the last step."""
+    config = small_config(tmp_path, cache, *RUN, "trainer.max_steps=1", "trainer.val_check_interval=1", "ckpt=auto")
+    with open_dict(config):
+        config.callbacks.signal = {"_target_": f"{__name__}.signal_at", "moment": moment}
+    assert train(config) == {}
+    assert names(tmp_path) == ["step-1.ckpt"]
+    assert not (tmp_path / "metrics.json").exists()
+    del config.callbacks.signal
+    assert train(config)["trained"]
+
+
+def signal_at(moment: str) -> lightning.Callback:
+    """SIGTERM at a moment of the training."""
+    return LambdaCallback(
+        **{moment: lambda trainer, *_: trainer.state.fn == "fit" and signal.raise_signal(signal.SIGTERM)}
+    )
+
+
+def test_a_signal_ends_an_evaluation_at_once(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lightning's own handler would only record it; the one that it records while it prepares is raised again."""
+    run, handlers, raised = build(small_config(tmp_path, cache, *RUN)), [], []
+    load = run.datamodule.val_dataloader
+    monkeypatch.setattr(run.datamodule, "val_dataloader", lambda: os.kill(os.getpid(), signal.SIGTERM) or load())
+    monkeypatch.setattr(signal, "raise_signal", raised.append)
     note = LambdaCallback(on_validation_batch_start=lambda *_: handlers.append(signal.getsignal(signal.SIGTERM)))
     run.trainer.callbacks.append(note)  # pyright: ignore[reportAttributeAccessIssue]
     before = signal.getsignal(signal.SIGTERM)
     run.trainer.validate(run.module, datamodule=run.datamodule, verbose=False)
     signal.signal(signal.SIGTERM, before)
     assert handlers == [signal.SIG_DFL]
+    assert raised == [signal.SIGTERM]
 
 
 def test_slurms_notice_during_an_evaluation_leaves_the_requeueing_to_the_job(tmp_path, cache, monkeypatch) -> None:

@@ -93,6 +93,8 @@ class StopOnSignal(lightning.Callback):
             signal.signal(signal.SIGTERM, signal.SIG_DFL)
             if hasattr(signal, "SIGUSR1"):
                 signal.signal(signal.SIGUSR1, _leave)
+            if trainer.received_sigterm:  # while the evaluation was prepared
+                signal.raise_signal(signal.SIGTERM)
 
     def _note(self, number: int, frame: FrameType | None) -> None:
         self.received = True
@@ -102,9 +104,7 @@ class StopOnSignal(lightning.Callback):
 
     def on_train_batch_end(self, trainer: lightning.Trainer, *args: Any) -> None:
         """Saves and stops at the end of the step in which a signal reached any rank."""
-        # Before training starts, Lightning's own handler records a SIGTERM.
-        asked = self.received or bool(getattr(trainer, "received_sigterm", False))
-        if not trainer.strategy.reduce_boolean_decision(asked, all=False):
+        if not self._reached_any_rank(trainer):
             return
         path = Path(trainer.default_root_dir) / "checkpoints" / f"step-{trainer.global_step}.ckpt"
         if not getattr(trainer, "fast_dev_run", False):
@@ -112,6 +112,15 @@ class StopOnSignal(lightning.Callback):
         trainer.limit_val_batches = 0  # should_stop alone would evaluate once more
         trainer.should_stop = True
         log.warning("stopping after a signal: saved %s; resume with ckpt=last", path)
+
+    def on_train_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Notes a signal that came after the last step, so that no evaluation follows."""
+        trainer.should_stop |= self._reached_any_rank(trainer)
+
+    def _reached_any_rank(self, trainer: lightning.Trainer) -> bool:
+        # Before training starts, Lightning's own handler records a SIGTERM.
+        asked = self.received or bool(getattr(trainer, "received_sigterm", False))
+        return trainer.strategy.reduce_boolean_decision(asked, all=False)
 
     def teardown(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, stage: str) -> None:
         """Restores the handlers that Lightning has not restored; also runs after an error."""

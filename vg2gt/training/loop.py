@@ -253,9 +253,9 @@ def fit(run: Run, checkpoint: Path | None) -> bool:
     # Rank 0 decides for all ranks: saving is collective and creates the file.
     if trainer.strategy.broadcast(not run.trial and not last.is_file()):
         trainer.save_checkpoint(last)
-    if run.trial or trainer.global_step >= trainer.max_steps:
+    if not trainer.should_stop and (run.trial or trainer.global_step >= trainer.max_steps):
         return True
-    log.warning("training ended at step %d of %d", trainer.global_step, trainer.max_steps)
+    log.warning("training ended at step %d of %d, without an evaluation", trainer.global_step, trainer.max_steps)
     return False
 
 
