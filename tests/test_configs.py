@@ -191,7 +191,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "vg2gt.baselines.VoxelMerged": {"voxel_size": 0.002, "min_footprint": 3.3},
     "vg2gt.rendering.Renderer": {
         "depth": "median", "lowpass": 0.3, "alpha_max": 0.99, "slope_floor": 30.0, "bisections": 12, "newton_steps": 2,
-        "geometry": True,
+        "geometry": True, "footprints": False, "absgrad": False,
     },
     "vg2gt.losses.GeometryLoss": {"depth": 1.0, "point": 1.0, "gamma": 1.0, "alpha": 0.2, "quantile": 0.98},
     "vg2gt.losses.EnhancementLoss": {"margin": 0.0, "form": "improve", "on": "total"},

@@ -293,6 +293,27 @@ class Gaussians(TensorRecord):
 
 
 @dataclass(frozen=True)
+class Footprints(TensorRecord):
+    """Gaussians on the images, for densification: each in the V views of its own scene. All 0 where not visible.
+
+    Attributes:
+        means2d: ``[V, G, 2]`` projected means in pixels: a leaf of the autograd graph, whose ``grad`` the backward pass
+            sets.
+        radii: ``[V, G]`` half the longer side, in pixels, of the box of all places with an alpha of at least 1/255.
+        absgrad: ``[V, G, 2]`` sum over pixels of the absolute values of each pixel's share in the gradient of
+            ``means2d``; backward passes add to it. None if not asked for.
+    """
+
+    means2d: Tensor
+    radii: Tensor
+    absgrad: Tensor | None = None
+
+    def select(self, views: slice = slice(None), gaussians: slice = slice(None)) -> Footprints:
+        """Returns those of some views and Gaussians, in the same memory."""
+        return self.map(lambda tensor: tensor[views, gaussians])
+
+
+@dataclass(frozen=True)
 class Render(TensorRecord):
     """Rendered views.
 
@@ -301,12 +322,14 @@ class Render(TensorRecord):
         depth: ``[B, V, H, W]`` z-depth, 0 where the ray has none (a hole).
         normal: ``[B, V, 3, H, W]`` blended camera-frame normals (not unit length), facing the camera.
         alpha: ``[B, V, H, W]`` accumulated opacity in [0, 1].
+        footprints: the Gaussians on the images, on the device that rendered; None if not asked for.
     """
 
     color: Tensor
     depth: Tensor
     normal: Tensor
     alpha: Tensor
+    footprints: Footprints | None = None
 
 
 @dataclass(frozen=True)

@@ -123,14 +123,15 @@ def variants() -> dict[str, Launch]:
     found: dict[str, Launch] = {}
     kinds = [("solid", "median", True), ("rasterized", "median", True), ("rasterized", "expected", True)]
     kinds += [(mode, "median", False) for mode in ("solid", "rasterized")]
-    cases = [(*case, False) for case in product(kinds, (0, 1, 2, 3))]
-    cases += [((mode, "median", True), degree, True) for mode in ("solid", "rasterized") for degree in (0, 2)]
-    for (mode, depth, geometry), degree, antialiased in cases:
+    cases = [(*case, False, False) for case in product(kinds, (0, 1, 2, 3))]
+    cases += [((mode, "median", True), degree, True, False) for mode in ("solid", "rasterized") for degree in (0, 2)]
+    cases += [(kind, 0, False, True) for kind in kinds]
+    for (mode, depth, geometry), degree, antialiased, absgrad in cases:
         gaussians = with_gradients(floats_to(soup(40, degree=degree), torch.float32))
         cameras = floats_to(cameras_around((16, 24)), torch.float32)
         cameras = replace(cameras, world_to_camera=cameras.world_to_camera.requires_grad_(degree == 0))
         options: Any = {"mode": mode, "depth": depth, "geometry": geometry, "antialiased": antialiased}
-        renderer = Renderer(implementation="triton", **options)
+        renderer = Renderer(implementation="triton", **options, absgrad=absgrad)
         with recorded() as launches:
             out = renderer(gaussians, cameras)
             outputs = [out.color, out.depth, out.normal] if geometry else [out.color]

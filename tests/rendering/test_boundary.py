@@ -140,7 +140,7 @@ def test_the_kernels_that_know_one_background_get_each_scenes_own(monkeypatch: p
     gaussians, cameras = two_scenes()
     monkeypatch.setattr("vg2gt.rendering.renderer._resolve", lambda *_: "triton")
 
-    def stand_in(gaussians: Gaussians, cameras: Cameras, background: torch.Tensor, options: RenderOptions) -> Render:
+    def stand_in(gaussians: Gaussians, cameras: Cameras, background: torch.Tensor, *_: RenderOptions, **__) -> Render:
         assert background.shape == (3,)
         with monkeypatch.context() as patch:
             patch.setattr("vg2gt.rendering.renderer._resolve", lambda *_: "dense")

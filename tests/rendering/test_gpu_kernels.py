@@ -24,7 +24,8 @@ SHORT = (
     "emit",
     "list",
     "blend newton=True solid=True geometry=True mean=False",
-    "backward solid=True geometry=True mean=False",
+    "backward solid=True geometry=True mean=False absolute=False",
+    "backward solid=False geometry=False mean=False absolute=True",
 )
 
 

@@ -24,6 +24,7 @@ from tests.rendering.scenes import (
     wall,
     with_gradients,
 )
+from tests.rendering.test_footprints import assert_same_footprints, footprints_of, some_hidden
 from vg2gt.rendering import render
 from vg2gt.rendering.options import DepthKind, Mode
 
@@ -78,6 +79,20 @@ def test_antialiased_equals_the_reference(mode: Mode) -> None:
     options = {"mode": mode, "bisections": 40, "antialiased": True}
     expected = render_with_gradients(gaussians, cameras, implementation="dense", **options)
     assert_same_render(render_with_gradients(gaussians, cameras, DEVICE, implementation="triton", **options), expected)
+
+
+@runnable
+@pytest.mark.parametrize("kind", [KINDS[1], *(pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS[::2])])
+def test_footprints_equal_the_reference(kind: tuple[Mode, DepthKind], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Views rendered one by one, with gradient rows of one view at once."""
+    from vg2gt.rendering import gpu_tiles
+
+    gaussians, cameras = some_hidden(2, 4, (4, 9))
+    held = {gpu_tiles.ROWS: 5, gpu_tiles.SLOTS: len(gaussians)}
+    monkeypatch.setattr(gpu_tiles, "_at_once", lambda device, otherwise, each: held[otherwise])
+    options = {"mode": kind[0], "depth": kind[1], "bisections": 40}
+    expected = footprints_of(gaussians, cameras, implementation="dense", **options)
+    assert_same_footprints(footprints_of(gaussians, cameras, DEVICE, implementation="triton", **options), expected)
 
 
 @runnable

@@ -17,14 +17,16 @@ from torch import Tensor
 from vg2gt.kernels.threads import parallel_for
 from vg2gt.rendering.constants import CONVERGED, MEDIAN_MAX_TRANSMITTANCE, NEGLIGIBLE, TRANSMITTANCE_STOP
 from vg2gt.rendering.cpu import tiles
-from vg2gt.rendering.cpu.backward import backward_color, backward_rasterized, backward_solid
+from vg2gt.rendering.cpu.backward import BACKWARD
 from vg2gt.rendering.cpu.forward import forward_color, forward_rasterized, forward_solid
 from vg2gt.rendering.cpu.projection import BLOCK, project_block
 from vg2gt.rendering.cpu.projection_backward import CHUNK, FIELDS, project_backward_block
 from vg2gt.rendering.cpu.tiles import count_tiles, depth_order, fill_tiles
+from vg2gt.rendering.footprints import note_visible
 from vg2gt.rendering.median import depth_factors
 from vg2gt.rendering.options import RenderOptions
 from vg2gt.rendering.scenes import Images, SceneViews
+from vg2gt.types import Footprints
 
 TILES_PER_ITEM = 8
 HIT_CAPACITY = 128  # hits per ray for the depth solver, even; a tile with more gets a larger buffer
@@ -35,7 +37,8 @@ _local = threading.local()
 
 def rasterize_cpu(scene: SceneViews, options: RenderOptions) -> Images:
     """Renders every view; differentiable in every tensor of the scene."""
-    return _Rasterize.apply(*scene.tensors, scene.size, options)  # pyright: ignore[reportReturnType]
+    means2d, into = (scene.footprints.means2d, scene.footprints.detach()) if scene.footprints else (None, None)
+    return _Rasterize.apply(*scene.tensors, means2d, scene.size, options, into)  # pyright: ignore[reportReturnType]
 
 
 @dataclass(frozen=True)
@@ -90,7 +93,7 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *inputs: Any) -> Images:
         """Returns colour and normals ``[V, H, W, 3]``, depth and accumulated opacity ``[V, H, W]``."""
-        tensors, (size, options) = inputs[:8], inputs[8:]
+        tensors, (size, options, footprints) = inputs[:8], inputs[9:]
         arrays = [_array(tensor) for tensor in tensors]
         count, (height, width), dtype = len(arrays[5]), size, arrays[0].dtype
         color = np.empty((count, height, width, 3), dtype)
@@ -100,11 +103,13 @@ class _Rasterize(torch.autograd.Function):
         for index in range(count):
             view = _select(arrays, index, size)
             lists.append(_prepare(view, options))
+            if footprints is not None:
+                _note(lists[-1], footprints, index)
             outputs = (array[index] for array in (color, normal, depth, slope, transmittance))
             _forward(view, lists[-1], options, *outputs)
         images = [torch.from_numpy(array) for array in (color, normal, depth, 1 - transmittance)]
         ctx.save_for_backward(*tensors, *images, torch.from_numpy(slope), torch.from_numpy(transmittance))
-        ctx.lists, ctx.size, ctx.options = lists, size, options
+        ctx.lists, ctx.size, ctx.options, ctx.footprints = lists, size, options, footprints
         ctx.set_materialize_grads(False)
         return images[0], images[1], images[2], images[3]
 
@@ -124,18 +129,23 @@ class _Rasterize(torch.autograd.Function):
         incoming = [_array(grad) for grad in (grad_color, grad_normal, grad_alpha, solid, expected, crossing)]
         arrays = [_array(tensor) for tensor in ctx.saved_tensors[:8]]
         grads = [np.zeros_like(array) for array in arrays]
+        footprints: Footprints | None = ctx.footprints
+        grad_means2d = None if footprints is None else torch.zeros_like(footprints.means2d)
+        width = tiles.ABSOLUTE_ROW if footprints is not None and footprints.absgrad is not None else tiles.ROW
         for index, lists in enumerate(ctx.lists):
             view = _select(arrays, index, ctx.size)
-            rows = _aligned(len(lists.members) * tiles.ROW, view.means.dtype).reshape(-1, tiles.ROW)
+            rows = _aligned(len(lists.members) * width, view.means.dtype).reshape(-1, width)
             planes = [array[index] for array in (*images, *incoming)]
             _backward(view, lists, options, geometry, planes, rows, grads, index)
+            if footprints is not None and grad_means2d is not None:
+                _note_gradients(lists, rows, grad_means2d[index], footprints.select(slice(index, index + 1)))
         if ctx.needs_input_grad[7]:
             grads[7] = np.einsum("vhwc,vhw->c", incoming[0], images[3])
         result = [
             torch.from_numpy(grad) if needed else None
             for grad, needed in zip(grads, ctx.needs_input_grad[:8], strict=True)
         ]
-        return (*result, None, None)
+        return (*result, grad_means2d, None, None, None)
 
 
 def _array(tensor: Tensor) -> np.ndarray:
@@ -171,6 +181,23 @@ def _prepare(view: _View, options: RenderOptions) -> _Lists:
     members, places = np.empty(starts[-1], np.int32), np.empty(starts[-1], np.int64)
     fill_tiles(boxes, visible, view.across, offsets, starts[:-1].copy(), members, places)
     return _Lists(records, boxes, counts, offsets, starts, members, places, np.zeros(len(members), np.uint16))
+
+
+def _note(lists: _Lists, footprints: Footprints, index: int) -> None:
+    """Notes the visible Gaussians of one view."""
+    seen = np.flatnonzero(lists.counts)
+    r = torch.from_numpy(lists.records[seen])
+    note_visible(footprints, index, torch.from_numpy(seen), r[:, :2], r[:, 2:5], r[:, 5:7], r[:, 9], r[:, 11])
+
+
+def _note_gradients(lists: _Lists, rows: np.ndarray, grad: Tensor, footprints: Footprints) -> None:
+    """Writes the gradient of one view's positions ``[G, 2]``, and adds the absolute one if asked for."""
+    seen = np.flatnonzero(lists.counts)
+    columns = np.concatenate((rows[:, :2], rows[:, tiles.ROW :]), 1, dtype=np.float64)
+    sums = torch.from_numpy(np.add.reduceat(columns, lists.offsets[seen])).to(grad.dtype)
+    grad[seen] = sums[:, :2]
+    if footprints.absgrad is not None:
+        footprints.absgrad[0, seen] += sums[:, 2:]
 
 
 def _parameters(options: RenderOptions, dtype: np.dtype) -> np.ndarray:
@@ -252,9 +279,7 @@ def _backward(
     parameters = _parameters(options, view.means.dtype)
     height, width = view.size
     solid = options.mode == "solid"
-    visit_tiles = backward_color
-    if geometry:
-        visit_tiles = backward_solid if solid else backward_rasterized
+    visit_tiles = BACKWARD[options.mode if geometry else "color", rows.shape[1] > tiles.ROW]
 
     def rasterize(tile_range: tuple[int, int]) -> None:
         scratch = _scratch(view.means.dtype)

@@ -19,13 +19,14 @@ from vg2gt.rendering.constants import (
     NEGLIGIBLE,
     TRANSMITTANCE_STOP,
 )
+from vg2gt.rendering.footprints import note_visible
 from vg2gt.rendering.gpu import kernels as launchable
 from vg2gt.rendering.gpu.binning import ENTRIES
 from vg2gt.rendering.gpu.projection import BLOCK, REFUSED, SLOTS
 from vg2gt.rendering.gpu.projection_backward import CAMERA
 from vg2gt.rendering.gpu.tiles import RECORD, TILE
 from vg2gt.rendering.options import RenderOptions
-from vg2gt.types import Cameras, Gaussians, Render
+from vg2gt.types import Cameras, Footprints, Gaussians, Render
 
 kernels: Any = launchable  # Triton kernels are launched as kernel[grid](...), which type checkers do not know
 
@@ -39,7 +40,12 @@ class RefusedError(ValueError):
 
 
 def render_triton(
-    gaussians: Gaussians, cameras: Cameras, background: Tensor, options: RenderOptions, rows: int | None = None
+    gaussians: Gaussians,
+    cameras: Cameras,
+    background: Tensor,
+    options: RenderOptions,
+    rows: int | None = None,
+    footprints: Footprints | None = None,
 ) -> Render:
     """Renders every view of every scene; differentiable in every floating-point tensor.
 
@@ -49,6 +55,7 @@ def render_triton(
         background: ``[3]``.
         options: render options.
         rows: maximum number of gradient rows held at once, at least those of one view; None: by the device's memory.
+        footprints: of all Gaussians and views, to be filled; None: not asked for.
 
     Raises:
         RefusedError: if a value is not finite or out of range, or the Gaussians
@@ -61,9 +68,12 @@ def render_triton(
         slots = _at_once(gaussians.means.device, SLOTS, SLOT_SHARE * SLOT_BYTES)
         some = max(1, slots // max(1, len(gaussians)))
         parts = []
-        for poses, intrinsics in zip(tensors[5].split(some, 1), tensors[6].split(some, 1), strict=True):
-            inputs = (*tensors[:5], poses, intrinsics, background, gaussians.batch, cameras.size, options, rows)
-            parts.append(_Render.apply(*inputs))
+        for number, (poses, intrinsics) in enumerate(
+            zip(tensors[5].split(some, 1), tensors[6].split(some, 1), strict=True)
+        ):
+            own = footprints and footprints.select(slice(number * some, (number + 1) * some))
+            inputs = (*tensors[:5], poses, intrinsics, background, gaussians.batch, own and own.means2d)
+            parts.append(_Render.apply(*inputs, cameras.size, options, rows, own and own.detach()))
     joined = parts[0] if len(parts) == 1 else [torch.cat(images, 1) for images in zip(*parts, strict=True)]
     color, normal, depth, alpha = joined
     return Render(color, depth, normal, alpha)
@@ -96,12 +106,14 @@ class _Render(torch.autograd.Function):
     def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Returns colour and normals ``[B, V, 3, H, W]``, depth and accumulated opacity ``[B, V, H, W]``."""
         tensors = tuple(tensor.contiguous() for tensor in inputs[:9])
-        (height, width), options, rows = inputs[9:]
+        (height, width), options, rows, footprints = inputs[10:]
         poses, background = tensors[5], tensors[7]
         scenes, views = poses.shape[:2]
         rows = rows or _at_once(poses.device, ROWS, ROW_SHARE * 4 * RECORD)
         lists = _list(tensors, (height, width), options, rows)
         solid = options.mode == "solid"
+        if footprints is not None:
+            _note(lists, footprints, solid)
         across, tiles = _tiles(height, width)
         make = torch.empty if options.geometry else torch.zeros
         shape, like = (scenes, views, height, width), {"dtype": poses.dtype, "device": poses.device}
@@ -118,7 +130,7 @@ class _Render(torch.autograd.Function):
             solid=solid, geometry=options.geometry, mean=options.depth == "expected", num_warps=1,
         )  # fmt: skip
         ctx.save_for_backward(*tensors, *lists[:5], color, normal, depth, transmittance, slopes)
-        ctx.chunks, ctx.size, ctx.options = lists.chunks, (height, width), options
+        ctx.chunks, ctx.size, ctx.options, ctx.footprints = lists.chunks, (height, width), options, footprints
         ctx.set_materialize_grads(False)
         return color, normal, depth, alpha
 
@@ -145,17 +157,26 @@ class _Render(torch.autograd.Function):
         of_cameras = ctx.needs_input_grad[5] or ctx.needs_input_grad[6]
         grad_cameras = poses.new_zeros(blocks if of_cameras else 1, scenes * views, CAMERA)
         degree = _degree(sh)
+        footprints: Footprints | None = ctx.footprints
+        grad_means2d = None if footprints is None else torch.zeros_like(footprints.means2d)
+        absolute = footprints is not None and footprints.absgrad is not None
         for first, some, begin, end in lists.chunks:
             if begin == end:
                 continue
             rows = means.new_zeros(end - begin, RECORD)
+            sums = rows.new_zeros(end - begin if absolute else 1, 2)
             kernels.backward_kernel[(scenes * some * tiles,)](
-                lists.records, lists.members, lists.places, lists.starts, *images, *incoming, rows,
+                lists.records, lists.members, lists.places, lists.starts, *images, *incoming, rows, sums,
                 height, width, across, tiles, views, first, some, begin,
                 alpha_max=options.alpha_max, stop=TRANSMITTANCE_STOP, slope_floor=options.slope_floor,
                 tiny=torch.finfo(means.dtype).tiny,
-                solid=solid, geometry=geometry, mean=options.depth == "expected", num_warps=1,
+                solid=solid, geometry=geometry, mean=options.depth == "expected", absolute=absolute, num_warps=1,
             )  # fmt: skip
+            if footprints is not None and grad_means2d is not None:
+                of_views = slice(first, first + some)
+                grad_means2d[of_views] = _per_gaussian(rows[:, :2], lists, total, of_views)
+                if footprints.absgrad is not None:
+                    footprints.absgrad[of_views] += _per_gaussian(sums, lists, total, of_views)
             kernels.project_backward_kernel[(blocks,)](
                 means, quats, scales, opacities, sh, batch, poses, intrinsics, lists.records, lists.ends, rows,
                 *grads, grad_cameras, total, views, scenes, height, width, first, some, begin,
@@ -170,7 +191,26 @@ class _Render(torch.autograd.Function):
             grad_intrinsics = summed[:, 16:].view(intrinsics.shape)
         if ctx.needs_input_grad[7]:
             grad_background = (incoming[0] * transmittance[:, :, None]).sum((0, 1, 3, 4))
-        return (*grads, grad_poses, grad_intrinsics, grad_background, None, None, None, None)
+        return (*grads, grad_poses, grad_intrinsics, grad_background, None, grad_means2d, None, None, None, None)
+
+
+def _note(lists: _Lists, footprints: Footprints, solid: bool) -> None:
+    """Notes the visible Gaussians of all views."""
+    slots = _counts(lists.ends).nonzero()[:, 0]
+    r, total = lists.records.view(-1, RECORD)[slots], max(1, footprints.radii.shape[1])
+    curvature = 1 / (r[:, 7] ** 2 * r[:, 8]) if solid else torch.zeros_like(r[:, 7])
+    note_visible(footprints, slots // total, slots % total, r[:, :2], r[:, 2:5], r[:, 5:7], curvature, r[:, 9])
+
+
+def _per_gaussian(rows: Tensor, lists: _Lists, total: int, views: slice) -> Tensor:
+    """Returns the sums ``[views, G, 2]`` of the rows ``[entries, 2]`` of some views, in order."""
+    counts = _counts(lists.ends)[views.start * total : views.stop * total]
+    summed = torch.segment_reduce(rows.contiguous(), "sum", lengths=counts, unsafe=True)
+    return summed.view(-1, total, 2)
+
+
+def _counts(ends: Tensor) -> Tensor:
+    return torch.diff(ends, prepend=ends.new_zeros(1))
 
 
 def _tiles(height: int, width: int) -> tuple[int, int]:

@@ -33,6 +33,8 @@ class RenderOptions:
         newton_steps: Newton steps after the bisections; 0: bisections alone. The compiled renderers (CPU and GPU) mix
             both and stop at convergence; they are at least as accurate as these numbers give.
         geometry: False renders colour and alpha only; depth and normal are zero.
+        footprints: also return positions, with their gradients, and radii of the Gaussians on the images.
+        absgrad: the same, and sums over pixels of absolute gradients (AbsGS, `absgrad` of gsplat).
 
     Raises:
         ValueError: if an option is unknown or out of range; the message names it.
@@ -48,6 +50,8 @@ class RenderOptions:
     bisections: int = 12
     newton_steps: int = 2
     geometry: bool = True
+    footprints: bool = False
+    absgrad: bool = False
 
     def __post_init__(self) -> None:
         check_choice("mode", self.mode, Mode)

@@ -53,6 +53,11 @@ class Splats:
     normal: Tensor
     color: Tensor
 
+    @property
+    def cutoff(self) -> Tensor:
+        """``[N]`` D^2 where alpha is 1/255."""
+        return 2 * torch.log(self.opacity / ALPHA_MIN)
+
     def __getitem__(self, index: Tensor) -> Splats:
         return Splats(*(getattr(self, field.name)[index] for field in fields(self)))
 
@@ -118,24 +123,28 @@ def screen_box(splats: Splats) -> tuple[Tensor, Tensor]:
         Box ``[N, 4]`` as (x0, y0, x1, y1), ends included, and ``[N]`` bool: False where there is no such pixel or the
         Gaussian straddles the camera plane.
     """
-    cutoff = 2 * torch.log(splats.opacity / ALPHA_MIN)
-    q0, q1 = splats.tilt.unbind(-1)
-    k = 1 - cutoff * splats.curvature
-    xx = k * splats.conic[:, 0] - cutoff * q0 * q0
-    xy = k * splats.conic[:, 1] - cutoff * q0 * q1
-    yy = k * splats.conic[:, 2] - cutoff * q1 * q1
-    det = xx * yy - xy * xy
-    bounded = (cutoff > 0) & (k > 0) & (xx > 0) & (det > 0)
-    inv_xx, inv_xy, inv_yy = yy / det, -xy / det, xx / det
-    offset = torch.stack((inv_xx * q0 + inv_xy * q1, inv_xy * q0 + inv_yy * q1), -1) * cutoff[:, None]
-    radius2 = cutoff * (1 + (splats.tilt * offset).sum(-1))
-    half = (torch.stack((inv_xx, inv_yy), -1) * radius2[:, None]).clamp(min=0).sqrt()
+    offset, half, bounded = half_box(splats.conic, splats.tilt, splats.curvature, splats.cutoff)
     middle = splats.center + offset
     return torch.cat((middle - half, middle + half), -1), bounded
 
 
-def visible_splats(scene: SceneViews, options: RenderOptions) -> Splats:
-    """Returns the splats in the image, front to back by the depth of their means.
+def half_box(conic: Tensor, tilt: Tensor, curvature: Tensor, cutoff: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Returns offset from the centre and half sides of :func:`screen_box` ``[N, 2]``, and whether it is bounded."""
+    q0, q1 = tilt.unbind(-1)
+    k = 1 - cutoff * curvature
+    xx = k * conic[:, 0] - cutoff * q0 * q0
+    xy = k * conic[:, 1] - cutoff * q0 * q1
+    yy = k * conic[:, 2] - cutoff * q1 * q1
+    det = xx * yy - xy * xy
+    bounded = (cutoff > 0) & (k > 0) & (xx > 0) & (det > 0)
+    inv_xx, inv_xy, inv_yy = yy / det, -xy / det, xx / det
+    offset = torch.stack((inv_xx * q0 + inv_xy * q1, inv_xy * q0 + inv_yy * q1), -1) * cutoff[:, None]
+    radius2 = cutoff * (1 + (tilt * offset).sum(-1))
+    return offset, (torch.stack((inv_xx, inv_yy), -1) * radius2[:, None]).clamp(min=0).sqrt(), bounded
+
+
+def visible_splats(scene: SceneViews, options: RenderOptions) -> tuple[Splats, Tensor]:
+    """Returns the splats in the image, front to back by the depth of their means, and which Gaussians they are.
 
     Selecting first keeps the undefined derivatives of hidden Gaussians out of the graph.
     """
@@ -148,7 +157,7 @@ def visible_splats(scene: SceneViews, options: RenderOptions) -> Splats:
         inside = (box[:, 2] >= 0) & (box[:, 3] >= 0) & (box[:, 0] <= width - 1) & (box[:, 1] <= height - 1)
         index = torch.nonzero(in_front & bounded & inside)[:, 0]
         index = index[torch.argsort(splats.depth[index], stable=True)]
-    return project(scene.gather(index), options)
+    return project(scene.gather(index), options), index
 
 
 def respond(splats: Splats, pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:

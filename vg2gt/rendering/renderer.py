@@ -14,10 +14,11 @@ from vg2gt.geometry.spherical_harmonics import MAX_DEGREE
 from vg2gt.memory import note_sizes
 from vg2gt.rendering.cpu_tiles import rasterize_cpu
 from vg2gt.rendering.dense import rasterize_dense
+from vg2gt.rendering.footprints import make_footprints
 from vg2gt.rendering.options import Mode, RenderOptions
 from vg2gt.rendering.scenes import render_scenes
 from vg2gt.rendering.selfcheck import require_trusted
-from vg2gt.types import Cameras, Gaussians, Render, check_choice
+from vg2gt.types import Cameras, Footprints, Gaussians, Render, check_choice
 
 Implementation = Literal["auto", "dense", "cpu", "triton"]
 MIN_SCALE = 1e-10  # smaller ones overflow the inverse covariance in float32
@@ -69,13 +70,15 @@ class Renderer(RenderOptions):
             if implementation != "triton":  # whose kernels check the values themselves
                 _check_values(gaussians, cameras, color)
             gaussians, cameras = gaussians.map(_floats_to(dtype)), cameras.map(_floats_to(dtype))
+            if implementation == "cpu":
+                gaussians, cameras, color = gaussians.to("cpu"), cameras.to("cpu"), color.cpu()
+            footprints = make_footprints(views, len(gaussians), gaussians.means, options)
             if implementation == "triton":
-                return _render_triton(gaussians, cameras, color, options)
-            color = color.expand(scenes, 3)
-            if implementation == "dense":
-                return render_scenes(rasterize_dense, gaussians, cameras, color, options)
-            host = (gaussians.to("cpu"), cameras.to("cpu"), color.cpu())
-            return render_scenes(rasterize_cpu, *host, options).to(device)
+                out = _render_triton(gaussians, cameras, color, options, footprints)
+            else:
+                rasterize = rasterize_dense if implementation == "dense" else rasterize_cpu
+                out = render_scenes(rasterize, gaussians, cameras, color.expand(scenes, 3), options, footprints)
+            return replace(out.to(device), footprints=footprints)
 
 
 def render(
@@ -110,14 +113,17 @@ def render(
     return Renderer(mode=mode, near=near, **options)(gaussians, cameras, background)
 
 
-def _render_triton(gaussians: Gaussians, cameras: Cameras, background: Tensor, options: RenderOptions) -> Render:
+def _render_triton(
+    gaussians: Gaussians, cameras: Cameras, background: Tensor, options: RenderOptions, footprints: Footprints | None
+) -> Render:
     """Renders with Triton, imported only here because CPU builds of torch lack it; ``background``: ``[1 or B, 3]``."""
     from vg2gt.rendering.gpu_tiles import RefusedError, render_triton
 
     # The kernels take one background for all scenes.
     one = len(background) == 1
     try:
-        render = render_triton(gaussians, cameras, background[0] if one else background.new_zeros(3), options)
+        color = background[0] if one else background.new_zeros(3)
+        render = render_triton(gaussians, cameras, color, options, footprints=footprints)
     except RefusedError:
         _check_values(gaussians, cameras, background)
         raise

@@ -14,7 +14,7 @@ from vg2gt.geometry.spherical_harmonics import sh_to_rgb
 from vg2gt.kernels.threads import compilable
 from vg2gt.rendering.cpu.colors import ViewColors
 from vg2gt.rendering.options import RenderOptions
-from vg2gt.types import Cameras, Gaussians, Render
+from vg2gt.types import Cameras, Footprints, Gaussians, Render
 
 Images = tuple[Tensor, Tensor, Tensor, Tensor]
 """Colour (background blended in) and normals ``[V, H, W, 3]``, depth (0: none) and alpha ``[V, H, W]``."""
@@ -34,6 +34,7 @@ class SceneViews:
         intrinsics: ``[V, 3, 3]`` pixels, integer pixel centres, no skew.
         background: ``[3]``.
         size: image ``(height, width)``.
+        footprints: of these Gaussians in these views, to be filled; None: not asked for.
     """
 
     means: Tensor
@@ -45,17 +46,23 @@ class SceneViews:
     intrinsics: Tensor
     background: Tensor
     size: tuple[int, int]
+    footprints: Footprints | None = None
 
     @property
     def tensors(self) -> tuple[Tensor, ...]:
-        """The differentiable inputs in declaration order."""
-        return tuple(getattr(self, field.name) for field in fields(self) if field.name != "size")
+        """The differentiable inputs in declaration order, without footprints."""
+        return tuple(getattr(self, field.name) for field in fields(self)[:8])
 
     def view(self, index: int) -> SceneViews:
         """Returns the scene with one view (V = 1)."""
         one = slice(index, index + 1)
         colors = self.colors if self.colors.shape[0] == 1 else self.colors[one]
-        return replace(self, colors=colors, world_to_camera=self.world_to_camera[one], intrinsics=self.intrinsics[one])
+        poses, intrinsics, footprints = (
+            self.world_to_camera[one],
+            self.intrinsics[one],
+            self.footprints and self.footprints.select(one),
+        )
+        return replace(self, colors=colors, world_to_camera=poses, intrinsics=intrinsics, footprints=footprints)
 
     def gather(self, index: Tensor) -> SceneViews:
         """Returns the Gaussians of the given indices, in that order."""
@@ -67,11 +74,21 @@ Rasterizer = Callable[[SceneViews, RenderOptions], Images]
 
 
 def render_scenes(
-    rasterize: Rasterizer, gaussians: Gaussians, cameras: Cameras, background: Tensor, options: RenderOptions
+    rasterize: Rasterizer,
+    gaussians: Gaussians,
+    cameras: Cameras,
+    background: Tensor,
+    options: RenderOptions,
+    footprints: Footprints | None = None,
 ) -> Render:
-    """Renders B scenes into V views each; ``background`` is ``[B, 3]``."""
-    scenes = range(len(background))
-    images = [rasterize(_scene_views(gaussians.scene(b), cameras, b, background[b]), options) for b in scenes]
+    """Renders B scenes into V views each; ``background`` is ``[B, 3]``. Fills the footprints, if there are any."""
+    images, first = [], 0
+    for b, behind in enumerate(background):
+        views = _scene_views(gaussians.scene(b), cameras, b, behind)
+        last = first + len(views.means)
+        own = footprints and footprints.select(gaussians=slice(first, last))
+        images.append(rasterize(replace(views, footprints=own), options))
+        first = last
     color, normal, depth, alpha = (torch.stack(parts) for parts in zip(*images, strict=True))
     return Render(color.permute(0, 1, 4, 2, 3), depth, normal.permute(0, 1, 4, 2, 3), alpha)
 

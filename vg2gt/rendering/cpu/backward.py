@@ -16,6 +16,7 @@ from vg2gt.kernels.compiled_math import exp
 from vg2gt.rendering.constants import FAST, HALF, ONE, SUMS, TWO, ZERO
 from vg2gt.rendering.cpu import planes
 from vg2gt.rendering.cpu.tiles import (
+    ABSOLUTE_ROW,
     BLOCKS_ACROSS,
     LANE_X,
     LANE_Y,
@@ -104,8 +105,26 @@ def _reduce_geometry(sums, row):
     row[13], row[14], row[15] = m0, m1, m2
 
 
-def _make_backward_tile(geometry: bool, solid: bool) -> Callable[..., None]:
-    """Compiles the backward pass of one tile; ``geometry`` (depth and normals) and ``solid`` are constants in it."""
+@kernel_part(fastmath=SUMS, error_model="numpy")
+def _reduce_absolute(sums, row):
+    """Appends the absolute gradients of the centre to a gradient row."""
+    gx = gy = ZERO * row[0]
+    for lane in range(LANES):
+        v = np.uintp(lane)
+        gx += sums[planes.ABS_X + v]
+        gy += sums[planes.ABS_Y + v]
+    row[ROW], row[ROW + 1] = gx, gy
+
+
+def _make_backward_tile(geometry: bool, solid: bool, absolute: bool = False) -> Callable[..., None]:
+    """Compiles the backward pass of one tile, with its arguments as constants.
+
+    Args:
+        geometry: with depth and normals.
+        solid: whether they are those of solids.
+        absolute: rows end with sums over pixels of absolute gradients of the centre.
+    """
+    width = ABSOLUTE_ROW if absolute else ROW
 
     @kernel_part(fastmath=FAST, error_model="numpy")
     def backward_tile(records, colors, members, visits, places, x_tile, y_tile, parameters, state, sums, staged, rows):
@@ -117,7 +136,7 @@ def _make_backward_tile(geometry: bool, solid: bool) -> Callable[..., None]:
                 stage(records, colors, members[p : p + STAGED], staged)
                 for q in range(p, min(p + STAGED, len(members))):  # zeroes their rows, which also prefetches them
                     row = rows[places[q]]
-                    for i in range(ROW):
+                    for i in range(width):
                         row[i] = ZERO
             blocks = np.int64(visits[p])
             if blocks == 0:
@@ -127,7 +146,9 @@ def _make_backward_tile(geometry: bool, solid: bool) -> Callable[..., None]:
             a0, eps, opacity, cutoff = g[8], g[9], g[10], g[11]
             n0, n1, n2 = g[12], g[13], g[14]
             c0, c1, c2 = g[16], g[17], g[18]
-            sums[: len(sums) if geometry else planes.M0] = ZERO
+            sums[: planes.ABS_X if geometry else planes.M0] = ZERO
+            if absolute:
+                sums[planes.ABS_X :] = ZERO
             while blocks:
                 block = lowest_bit(blocks)  # pyright: ignore[reportCallIssue]
                 blocks &= blocks - 1
@@ -189,6 +210,9 @@ def _make_backward_tile(geometry: bool, solid: bool) -> Callable[..., None]:
                     ge = gd * inverse + gr * eps
                     gs = gt * z * inverse + TWO * gr * s if geometry else TWO * gr * s
                     gex, gey = ge * dx, ge * dy
+                    if absolute:
+                        sums[planes.ABS_X + v] += abs(TWO * (qa * gex + qb * gey) + gs * q0)
+                        sums[planes.ABS_Y + v] += abs(TWO * (qb * gex + qc * gey) + gs * q1)
                     sums[planes.AX + v] += gex
                     sums[planes.AY + v] += gey
                     sums[planes.AXX + v] += gex * dx
@@ -213,6 +237,8 @@ def _make_backward_tile(geometry: bool, solid: bool) -> Callable[..., None]:
             _reduce_color(sums, g, row)
             if geometry:
                 _reduce_geometry(sums, row)
+            if absolute:
+                _reduce_absolute(sums, row)
 
     return backward_tile
 
@@ -221,9 +247,12 @@ def _make_backward_tile(geometry: bool, solid: bool) -> Callable[..., None]:
 _backward_color = _make_backward_tile(False, False)
 _backward_rasterized = _make_backward_tile(True, False)
 _backward_solid = _make_backward_tile(True, True)
+_absolute_color = _make_backward_tile(False, False, True)
+_absolute_rasterized = _make_backward_tile(True, False, True)
+_absolute_solid = _make_backward_tile(True, True, True)
 
 
-def _make_backward_tiles(geometry: bool, solid: bool) -> Callable[..., None]:
+def _make_backward_tiles(geometry: bool, solid: bool, absolute: bool) -> Callable[..., None]:
     """Compiles the backward pass over tiles of :mod:`vg2gt.rendering.cpu.forward`."""
 
     @kernel(fastmath=FAST, error_model="numpy", nogil=True)
@@ -249,7 +278,14 @@ def _make_backward_tiles(geometry: bool, solid: bool) -> Callable[..., None]:
                 records, colors, members[begin:end], visits[begin:end], places[begin:end], x_tile, y_tile, parameters,
                 state, sums, staged, rows,
             )  # fmt: skip
-            if solid:
+            if absolute:
+                if solid:
+                    _absolute_solid(*args)
+                elif geometry:
+                    _absolute_rasterized(*args)
+                else:
+                    _absolute_color(*args)
+            elif solid:
                 _backward_solid(*args)
             elif geometry:
                 _backward_rasterized(*args)
@@ -259,6 +295,9 @@ def _make_backward_tiles(geometry: bool, solid: bool) -> Callable[..., None]:
     return backward_tiles
 
 
-backward_color = _make_backward_tiles(False, False)
-backward_rasterized = _make_backward_tiles(True, False)
-backward_solid = _make_backward_tiles(True, True)
+BACKWARD = {
+    (kind, absolute): _make_backward_tiles(kind != "color", kind == "solid", absolute)
+    for kind in ("color", "rasterized", "solid")
+    for absolute in (False, True)
+}
+"""By what is rendered and whether absolute gradients are asked for; compiled at the first call."""

@@ -10,7 +10,7 @@ C0, C1, C2, N0, N1, N2, MEDIAN, MEAN, HI, LO, THIN, NUM, DEN, LAST, MOVING, SOUG
 )
 REST, G0, G1, G2, G3, G4, G5, DEPTH, KD, GE, GM = (np.uintp(j * PLANE) for j in range(1, 12))
 # sums of one Gaussian's gradients over a tile's blocks
-AX, AY, AXX, AXY, AYY, B, BX, BY, GR, GO, K0, K1, K2, M0, M1, M2, GZ, GP = (
+AX, AY, AXX, AXY, AYY, B, BX, BY, GR, GO, K0, K1, K2, M0, M1, M2, GZ, GP, ABS_X, ABS_Y = (
     np.uintp(j * LANES) for j in range(SUMS_ROWS)
 )
 # one hit of each of a block's rays, and the next

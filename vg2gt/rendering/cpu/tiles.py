@@ -22,12 +22,13 @@ LANES = SIDE**2
 LANE_X, LANE_Y = (offset.ravel().astype(np.float32) for offset in np.meshgrid(np.arange(SIDE), np.arange(SIDE)))
 PLANE = TILE * TILE
 PLANES = 17  # planes of a tile's state
-SUMS_ROWS = 18  # gradient sums of one Gaussian, LANES values each
+SUMS_ROWS = 20  # gradient sums of one Gaussian, LANES values each
 HIT_SIZE = 3 * LANES  # one hit of each of a block's rays: alpha, peak, precision
 FIRST_COLUMN = sum(1 << row * BLOCKS_ACROSS for row in range(BLOCKS_ACROSS))  # bit mask of blocks
 STAGED = 16  # Gaussians copied at a time, with their colours
 RECORD = 16  # projected Gaussian: centre 2, conic 3, tilt 2, z, a0, eps, opacity, cutoff, normal 3, unused
 ROW = 16  # gradient of one (tile, Gaussian): centre 2, conic 3, tilt 2, z, a0, opacity, colour 3, normal 3
+ABSOLUTE_ROW = ROW + 2  # the same, and sums over pixels of absolute gradients of the centre
 
 
 @intrinsic

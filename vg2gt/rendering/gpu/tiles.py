@@ -214,13 +214,14 @@ def _transmit(records, members, place, last, px, py, wanted, t, alpha_max: tl.co
 @triton.jit(do_not_specialize=(*SIZES, "views", "first_view", "some_views", "base"))
 def backward_kernel(
     records, members, places, starts, color, normal, depth, transmittance, slopes,
-    grad_color, grad_normal, grad_depth, grad_alpha, rows,
+    grad_color, grad_normal, grad_depth, grad_alpha, rows, sums,
     height, width, across, tiles, views, first_view, some_views, base,
     alpha_max: tl.constexpr, stop: tl.constexpr, slope_floor: tl.constexpr, tiny: tl.constexpr,
-    solid: tl.constexpr, geometry: tl.constexpr, mean: tl.constexpr,
+    solid: tl.constexpr, geometry: tl.constexpr, mean: tl.constexpr, absolute: tl.constexpr,
 ):  # fmt: skip
     """Visits a tile's Gaussians front to back again and writes the gradient row of each (rows start at zero).
 
+    With ``absolute``, ``sums`` gets the sums over pixels of absolute gradients of the centre (2 values a row).
     Covers ``some_views`` of each scene's ``views``, from ``first_view`` on; their rows begin at ``base``.
     """
     dtype = records.dtype.element_ty
@@ -325,6 +326,14 @@ def backward_kernel(
                 tl.store(row, -2.0 * (tl.load(g + 2) * sx + qb * sy))
                 tl.store(row + 1, -2.0 * (qb * sx + tl.load(g + 4) * sy))
                 tl.store(row + 7, z_gradient)
+            if absolute:
+                pull_x, pull_y = tl.load(g + 2) * dx + qb * dy, qb * dx + tl.load(g + 4) * dy
+                gx, gy = 2.0 * ge * pull_x, 2.0 * ge * pull_y
+                if solid:
+                    gx, gy = gx + gs * tl.load(g + 5), gy + gs * tl.load(g + 6)
+                to = sums + (tl.load(places + place) - base).to(tl.int64) * 2
+                tl.store(to, tl.sum(tl.abs(gx), 0))
+                tl.store(to + 1, tl.sum(tl.abs(gy), 0))
             tl.store(row + 2, tl.sum(ge * dx * dx, 0))
             tl.store(row + 3, 2.0 * tl.sum(ge * dx * dy, 0))
             tl.store(row + 4, tl.sum(ge * dy * dy, 0))
