@@ -154,3 +154,17 @@ def test_a_radius_covers_what_is_seen_and_hardly_more() -> None:
     assert half <= float(out.footprints.radii) < half + 1
     assert half > 5
     assert out.footprints.means2d[0, 0].tolist() == [50.5, 50.5]
+
+
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("count", [0, 3])
+def test_nothing_is_seen(implementation: Implementation, count: int) -> None:
+    gaussians = soup(count)
+    hidden = with_gradients(replace(gaussians, means=-gaussians.means))
+    out = render(hidden, pinhole((5, 9)), implementation=implementation, absgrad=True)
+    out.color.sum().backward()
+    marks = out.footprints
+    assert marks is not None
+    assert marks.means2d.grad is not None
+    assert marks.absgrad is not None
+    assert not any(value.any() for value in (marks.means2d, marks.radii, marks.means2d.grad, marks.absgrad))
