@@ -164,7 +164,7 @@ class _Render(torch.autograd.Function):
             if begin == end:
                 continue
             rows = means.new_zeros(end - begin, RECORD)
-            sums = rows.new_zeros(end - begin if absolute else 1, 2)
+            sums = rows.new_zeros(end - begin, 2) if absolute else rows  # which the kernel then leaves alone
             kernels.backward_kernel[(scenes * some * tiles,)](
                 lists.records, lists.members, lists.places, lists.starts, *images, *incoming, rows, sums,
                 height, width, across, tiles, views, first, some, begin,
