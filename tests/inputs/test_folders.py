@@ -40,6 +40,14 @@ def test_what_is_no_photograph_is_not_taken(tmp_path: Path, caplog) -> None:
     assert f"images are taken from {tmp_path / 'images'}; 2 next to it are ignored" in caplog.text
 
 
+def test_folders_of_masks_of_other_names(tmp_path: Path, caplog) -> None:
+    """Masks in ``images_masks/``, as many as there are photographs, were taken instead of these without a word."""
+    for name in ("images/1.jpg", "images/2.jpg", "images_masks/1.png", "images_masks/2.png", "Segmentation/1.png"):
+        put(tmp_path / name)
+    assert {picture.path for picture in find_pictures(tmp_path)} == {tmp_path / f"images/{n}.jpg" for n in (1, 2)}
+    assert f"not used as masks: {tmp_path / 'Segmentation'}, {tmp_path / 'images_masks'} (" in caplog.text
+
+
 def test_files_that_are_not_read_are_named(tmp_path: Path, caplog, monkeypatch) -> None:
     put(tmp_path / "a.jpg")
     for name in ("b.dng", "c.EXR", "d.gif", "e.mp4", "more/f.nef", "notes.txt", ".g.dng"):

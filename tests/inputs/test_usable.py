@@ -43,7 +43,9 @@ def spoil(path: Path, how: str) -> None:
     dark, bright = noise.astype(np.uint8), (255 - noise / 4).astype(np.uint8)
     bright[:5, :20] = 100  # a rest that is not clipped
     moved = np.mean([np.roll(np.asarray(whole, np.float32), k, 1) for k in range(size[0] // 10)], 0)
+    disc = np.hypot(*(np.indices(size[::-1]) - np.array(size[::-1])[:, None, None] / 2)) < size[1] / 4
     spoilt = {
+        "silhouette": 255 * disc.astype(np.uint8),
         "black": dark,
         "white": bright,
         "blur": np.asarray(whole.filter(ImageFilter.GaussianBlur(size[0] / 40))),
@@ -62,6 +64,7 @@ SAID = {
     "blur": "is blurred",
     "shake": "is blurred",
     "grey": "is of one colour",
+    "silhouette": "is black and white only (a mask?",
 }
 
 

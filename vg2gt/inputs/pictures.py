@@ -22,6 +22,7 @@ from vg2gt.data.sources.masks import (
     mask_beside,
     mask_folder,
     resized_mask,
+    warn_of_unused,
     warn_without_mask,
 )
 from vg2gt.data.sources.parsing import PHOTO_SUFFIXES
@@ -37,9 +38,11 @@ from vg2gt.io.image_files import (
     frame_count,
     image_size,
     is_damaged,
+    orientation,
     read_color,
     read_mask,
     read_mask_file,
+    same_shape,
 )
 from vg2gt.io.images import color_image, has_alpha
 from vg2gt.io.photogrammetry import is_camera_file
@@ -135,7 +138,22 @@ def find_pictures(images: ImagesLike, max_images: int | None = None) -> list[Pic
     if known or any(masks.values()):
         lacking = [str(photo) for photo, mask in masks.items() if mask is None]
         warn_without_mask(lacking, len(masks), (known or [MASKS])[0])
+        _name_turned([photo for photo, mask in masks.items() if mask is not None])
+    else:
+        given = {Path(item).expanduser() for item in items if isinstance(item, (str, Path))}
+        warn_of_unused({each for each in given if each.is_dir()} | {photo.parent for photo in photos})
     return with_unique_names(taken)
+
+
+def _name_turned(photos: Sequence[Path]) -> None:
+    """Warns about photographs with masks that are turned such that the shape of a mask does not tell its direction."""
+    turned = [photo for photo in photos if orientation(photo, "") != 1]
+    both = [str(each) for each in turned if same_shape(image_size(each, ""), image_size(each, "", upright=True))]
+    if both:
+        log.warning(
+            "%d photographs are turned or mirrored by their EXIF data, which their masks do not tell; the masks are "
+            "taken as those of the upright photographs: %s", len(both), some(both),
+        )  # fmt: skip
 
 
 def check_pictures(paths: Sequence[str]) -> None:

@@ -196,9 +196,13 @@ def _faults(looks: dict[str, _Look]) -> dict[str, str]:
         float(np.median([getattr(look, name) for look in looks.values()]))
         for name in ("black", "white", "detail", "color")
     )
+    bilevel = np.quantile([look.black + look.white for look in looks.values()], 0.5, method="lower")
 
     def fault(look: _Look) -> str:
         """Returns what is wrong with one; empty if nothing is."""
+        both = look.black + look.white if min(look.black, look.white) > _SHOWN else 0
+        if several and both >= _NEARLY_ALL and bilevel < _USUAL:
+            return "is black and white only (a mask? masks are in a folder masks/, with the names of their images)"
         if look.black >= (_NEARLY_ALL if several and black < _USUAL else _ALL):
             return "is black"
         if look.white >= (_NEARLY_ALL if several and white < _USUAL else _ALL):

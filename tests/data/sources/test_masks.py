@@ -19,7 +19,7 @@ def _put(*files: Path, hidden: str = "") -> None:
         file.parent.mkdir(parents=True, exist_ok=True)
         pixels = np.full((24, 32), 255, np.uint8)
         pixels[:, {"left": slice(0, 16), "right": slice(16, 32)}.get(hidden, slice(0))] = 0
-        Image.fromarray(pixels).convert("L" if file.suffix == ".png" else "RGB").save(file)
+        Image.fromarray(pixels).convert("L" if file.suffix.lower() == ".png" else "RGB").save(file)
 
 
 @pytest.mark.parametrize(
@@ -35,6 +35,8 @@ def _put(*files: Path, hidden: str = "") -> None:
         ("front/1.jpg", "masks/1.png"),  # no other folder of photographs has an image of that name
         ("images/1.jpg", "masks/1.png"),  # images_4 holds the same image
         ("images/1.jpg", "Masks/1.PNG"),
+        ("images/a.JPG", "masks/A.jpg.Png"),
+        ("1.jpg", "1_MASK.PNG"),
         ("1.jpg", "mask/1.tif"),
         ("1.jpg", "masks/1_mask.png"),
         ("1.jpg", "1_mask.png"),  # as drone programs have it
@@ -47,7 +49,7 @@ def test_where_masks_are(tmp_path: Path, image: str, mask: str) -> None:
 
 
 def test_masks_next_to_their_images_are_no_photographs(tmp_path: Path, caplog) -> None:
-    names = ("1.jpg", "2.jpg", "1_mask.png", "2.mask.png", "face_mask.png", "1_mask_2.jpg")
+    names = ("1.jpg", "2.jpg", "1_MASK.PNG", "2.mask.png", "face_mask.png", "1_mask_2.jpg")
     _put(*(tmp_path / name for name in names), hidden="left")
     for given in (tmp_path, [tmp_path / name for name in names]):
         found = find_pictures(given)
@@ -55,6 +57,18 @@ def test_masks_next_to_their_images_are_no_photographs(tmp_path: Path, caplog) -
         masks = {picture.name: picture.read((24, 32)).mask for picture in found}
         assert [name for name, mask in masks.items() if mask is not None] == ["1", "2"]
         assert "2 of 4 images have no mask" in caplog.text
+
+
+@pytest.mark.parametrize(("orientation", "size", "said"), [(3, (32, 24), 1), (6, (32, 24), 0), (6, (32, 32), 1)])
+def test_masks_whose_shape_does_not_tell_their_direction(tmp_path: Path, caplog, orientation, size, said) -> None:
+    """As stored or upright: only a quarter turn of a photograph that is not square changes its shape."""
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    Image.new("RGB", size).save(tmp_path / "1.jpg", exif=exif)
+    (tmp_path / "masks").mkdir()
+    Image.new("L", size).save(tmp_path / "masks" / "1.png")
+    find_pictures(tmp_path)
+    assert caplog.text.count("taken as those of the upright photographs: ") == said
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from vg2gt.data.sources.parsing import OTHER_FOLDERS, PHOTO_SUFFIXES, is_image_folder
+from vg2gt.data.sources.parsing import MASK_FOLDERS, OTHER_FOLDERS, PHOTO_SUFFIXES, is_image_folder
 from vg2gt.io.errors import DataError, some
 from vg2gt.io.image_files import Size
 
@@ -60,16 +60,32 @@ def mask_of(folder: Path, name: str) -> Path | None:
         name: name of the image, relative to the image folder.
     """
     image = folder / name
-    return next((path for path in (*_candidates(image, ("", *_MARKS)), image) if path.is_file()), None)
+    return _named(image.parent, (*_candidates(image, ("", *_MARKS)), image.name))
 
 
-def _candidates(image: Path, marks: Sequence[str]) -> Iterator[Path]:
+def _candidates(image: Path, marks: Sequence[str]) -> Iterator[str]:
     """Yields the names that an image's mask can have in the folder of the image, with one of the marks."""
     for mark in marks:
         for suffix in _SUFFIXES:
-            for ending in (mark + suffix, mark + suffix.upper()):
-                yield image.with_name(image.name + ending)
-                yield image.with_name(image.stem + ending)
+            yield image.name + mark + suffix
+            yield image.stem + mark + suffix
+
+
+def _named(folder: Path, candidates: Iterable[str]) -> Path | None:
+    """Finds the first of some files in a folder, in any case."""
+    try:
+        known = _names(folder, folder.stat().st_mtime_ns)
+    except OSError:  # missing, or it cannot be listed
+        return None
+    return next((folder / known[key] for name in candidates for key in (name, name.lower()) if key in known), None)
+
+
+@lru_cache(maxsize=256)
+def _names(folder: Path, changed: int) -> Mapping[str, str]:
+    """Returns the files of a folder by their names and these in lower case; another ``changed`` invalidates it."""
+    with os.scandir(folder) as entries:
+        names = [entry.name for entry in entries if entry.is_file()]
+    return {name.lower(): name for name in names} | {name: name for name in names}
 
 
 def image_of_mask(path: Path) -> Path | None:
@@ -93,20 +109,9 @@ def image_beside(path: Path, marks: Sequence[str]) -> Path | None:
     return _same_stem(image.with_name(f"{image.name}.x"))
 
 
-@lru_cache(maxsize=256)
-def _marked(folder: Path, changed: int) -> frozenset[str]:
-    """Returns the names of a folder's files that can be masks of others; another ``changed`` invalidates the cache."""
-    with os.scandir(folder) as entries:
-        return frozenset(entry.name for entry in entries if Path(entry.name).stem.lower().endswith(_MARKS))
-
-
 def _next_to(image: Path) -> Path | None:
     """Finds the mask in an image's folder, ``NAME_mask.png``."""
-    try:
-        known = _marked(image.parent, image.parent.stat().st_mtime_ns)
-    except OSError:
-        return None
-    mask = next((path for path in _candidates(image, _MARKS) if path.name in known), None) if known else None
+    mask = _named(image.parent, _candidates(image, _MARKS))
     if mask is not None:
         _check_owner(mask, image.parent, (image.name,), 0)
     return mask
@@ -182,6 +187,7 @@ def find_masks(
     folder = mask_folder(folder.parent) or folder
     found = {i: known.get(i) or mask_beside(images[i]) or mask_of(folder, name) for i, name in names.items()}
     if not folder.is_dir() and not any(found.values()):
+        warn_of_unused({folder.parent})
         return {}
     lacking = [names[number] for number, path in found.items() if path is None]
     warn_without_mask(lacking, len(names), f"{folder} of {where}")
@@ -193,6 +199,14 @@ def warn_without_mask(lacking: Sequence[str], count: int, folder: str) -> None:
     if lacking:
         said = "%d of %d images have no mask in %s; all their pixels are used: %s"
         log.warning(said, len(lacking), count, folder, some(lacking))
+
+
+def warn_of_unused(folders: Iterable[Path]) -> None:
+    """Warns about folders in the given ones that hold masks by their names, none of which is used."""
+    places = sorted(place for folder in folders for place in folder.iterdir())
+    unused = [str(each) for each in places if MASK_FOLDERS.fullmatch(each.name) and each.is_dir()]
+    if unused:
+        log.warning("not used as masks: %s (masks are in %s/, with the names of their images)", some(unused), FOLDER)
 
 
 def joined_masks(masks: Sequence[NDArray[np.float32] | None]) -> NDArray[np.float32] | None:

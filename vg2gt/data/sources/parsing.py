@@ -27,8 +27,10 @@ from vg2gt.io.files import by_number, regular
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".tif", ".tiff", ".webp", ".bmp")
 PHOTO_SUFFIXES = (*IMAGE_SUFFIXES, ".heic", ".heif", ".avif", ".jfif", ".jpe")
 IMAGE_FOLDERS = ("images", "color", "rgb", "image", "input")
+MASK_FOLDERS = re.compile(r"(.*[._ -])?masks?([._ -].*)?|segmentations?|silhouettes?", re.IGNORECASE)
+"""Names of folders that hold masks; only ``masks`` and ``mask`` are used."""
 OTHER_FOLDERS = re.compile(
-    r"[._@].*|masks?|depths?|depth[_-].*|.*[_-]depths?|normals?|conf(idence)?|sparse|dense|stereo|semantics?|labels?|"
+    rf"{MASK_FOLDERS.pattern}|[._@].*|depths?|depth[_-].*|.*[_-]depths?|normals?|conf(idence)?|sparse|dense|stereo|semantics?|labels?|"
     r"thumb(nail)?s?|images_\d+",
     re.IGNORECASE,
 )
