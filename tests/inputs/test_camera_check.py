@@ -2,17 +2,20 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tests.inputs.test_usable import scenery
 from vg2gt.data.base import DataError
+from vg2gt.data.sources.sparse_points import ObservedPoints
 from vg2gt.inputs import camera_check
 from vg2gt.inputs.camera_check import check_cameras
 from vg2gt.inputs.given_cameras import given_pictures
-from vg2gt.inputs.pictures import Picture
+from vg2gt.inputs.pictures import Picture, frame_of
 from vg2gt.monitor import Monitor
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -42,12 +45,29 @@ def turned(pictures: list[Picture], change: Callable[[int, np.ndarray], np.ndarr
     return [replace(each, pose=change(number, each.pose)) for number, each in enumerate(pictures)]
 
 
-def test_right_cameras_pass_and_those_of_a_sparse_model_are_known(right: list[Picture], caplog) -> None:
+def test_right_cameras_pass(right: list[Picture], caplog) -> None:
     check_cameras(right, Monitor())
-    monitor = Monitor()
-    check_cameras([replace(each, pose=np.eye(4), points="of the model") for each in right], monitor)  # pyright: ignore
     assert not caplog.records
-    assert not monitor.seconds
+
+
+def test_images_that_a_model_is_not_made_of(caplog) -> None:
+    """Renamed photographs, or frames of a video taken again: the names fit, but its points are somewhere else."""
+    wall, places = scenery(0, (60, 200)), np.random.default_rng(0).uniform((0, 0), (1, 1), (400, 2))
+    views = []
+    for left in range(0, 120, 20):
+        inside = (places * (200, 60) - (left, 0)) / (80, 60)
+        seen = ((inside >= 0) & (inside < 1)).all(1)
+        points = ObservedPoints(np.flatnonzero(seen), inside[seen], np.ones(seen.sum(), np.float32))
+        pixels = wall[:, left : left + 80]
+        read = partial(lambda pixels, _: frame_of(pixels), pixels)
+        views.append(Picture(str(left), (60, 80), read, "COLMAP folder", points=points, pose=np.eye(4)))
+    check_cameras(views, Monitor())
+    assert not caplog.records
+    others = [replace(each, read=other.read) for each, other in zip(views, views[::-1], strict=True)]
+    with pytest.raises(DataError, match="the images are not those that COLMAP folder was made of"):
+        check_cameras(others, Monitor())
+    check_cameras(others, Monitor(), insisted=True)
+    assert "they are used as they are" in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -33,6 +33,9 @@ _WITHIN = 0.02  # of the longer side: between a feature and the ray of its match
 _PARALLEL = 0.3  # degrees between rays, below which the sign of the depth is noise
 _FITTING = 0.5  # share of a pair's matches that fit, below which the pair contradicts the cameras
 _CONTRADICTED = 0.5  # share of the pairs that contradict the cameras, from which they are wrong altogether
+_LOOKED_AT, _SMALL = 20, 320  # neighbours whose points are looked at, and the longer side of their images in pixels
+_COMMON = 30  # points of an image that others of these see, too
+_ALIKE = 0.5  # median correlation of their brightness, .92 and more in right models, below which images are others
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -57,21 +60,22 @@ _READINGS: dict[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
 def check_cameras(pictures: Sequence[Picture], monitor: Monitor, insisted: bool = False) -> None:
     """Checks given cameras by matched features of up to ten images, if pycolmap is installed.
 
-    A match fits if the cameras see one point in front of both within 2 % of the longer side.
+    A match fits if the cameras see one point in front of both within 2 % of the longer side. The points of a sparse
+    model are such matches; its images are checked to be those that it was made of.
 
     Args:
-        pictures: pictures with given cameras. Those of a sparse model, whose points are such matches, are not checked.
+        pictures: pictures with given cameras.
         monitor: shows the stage.
         insisted: only warn, because these cameras were asked for.
 
     Raises:
         DataError: if at least half of the pairs of images contradict the cameras; fewer are a warning.
     """
+    _check_points([each for each in pictures if each.points is not None], insisted)
     known = [each for each in pictures if each.pose is not None and each.points is None]
     if len(known) < len(pictures) or len(known) < 2 or importlib.util.find_spec("pycolmap") is None:
         return
-    starts = spread(len(known) - 1, min(_GROUPS, len(known) - 1))
-    chosen = [known[place] for place in sorted({place + step for place in starts for step in range(2)})]
+    chosen = _neighbours(known, _GROUPS)
     with monitor.stage("check cameras"):
         matches, views = match_pictures(chosen)
     shares = fitting_shares(matches, views)
@@ -86,10 +90,51 @@ def check_cameras(pictures: Sequence[Picture], monitor: Monitor, insisted: bool 
     if len(against) < _CONTRADICTED * len(shares):
         log.warning("%s; some cameras may be wrong, or the images show things that look alike or move", said)
         return
-    said = f"{said}. {_advice(matches, views, pictures[0].source.startswith('Nerfstudio'))}"
+    _refuse(f"{said}. {_advice(matches, views, pictures[0].source.startswith('Nerfstudio'))}", insisted)
+
+
+def _refuse(said: str, insisted: bool) -> None:
     if not insisted:
         raise DataError(f"{said}; --poses sfm finds the cameras from the images, --poses given takes these as they are")
     log.warning("%s; they are used as they are", said)
+
+
+def _neighbours(pictures: Sequence[Picture], count: int) -> list[Picture]:
+    """Returns up to ``count`` pairs of neighbours, evenly spread."""
+    starts = spread(len(pictures) - 1, min(count, len(pictures) - 1))
+    return [pictures[place] for place in sorted({place + step for place in starts for step in range(2)})]
+
+
+def _check_points(pictures: Sequence[Picture], insisted: bool) -> None:
+    """Checks that points of a sparse model look alike in the images that see them, as they do in its own images."""
+    if len(pictures) < _PAIRS:
+        return
+    seen = [_brightness(each) for each in _neighbours(pictures, _LOOKED_AT)]
+    points, rows = np.unique(np.concatenate([numbers for numbers, _ in seen]), return_inverse=True)
+    total, count = (np.bincount(rows, w, len(points)) for w in (np.concatenate([values for _, values in seen]), None))
+    found, start = [], 0
+    for _, values in seen:
+        own, start = rows[start : start + len(values)], start + len(values)
+        common = count[own] > 1
+        others = (total[own] - values)[common] / (count[own][common] - 1)
+        if len(others) >= _COMMON and min(others.std(), values[common].std()) > 0:
+            found.append(float(np.corrcoef(others, values[common])[0, 1]))
+    if len(found) >= _PAIRS and np.median(found) < _ALIKE:
+        _refuse(
+            f"the images are not those that {pictures[0].source} was made of: its points look different in each of "
+            "them. Were they renamed, turned, or taken from the video again",
+            insisted,
+        )
+
+
+def _brightness(picture: Picture) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Returns the numbers ``[n]`` of the points that a picture sees, and their brightness."""
+    assert picture.points is not None
+    scale = min(1.0, _SMALL / max(picture.size))
+    target = (max(1, round(picture.size[0] * scale)), max(1, round(picture.size[1] * scale)))
+    grey = reduce_to_fit(picture.read(target), (_SMALL, _SMALL)).images[0].mean(0).double().numpy()
+    columns, rows = (picture.points.places * grey.shape[::-1]).astype(int).T
+    return picture.points.numbers, grey[rows, columns]
 
 
 def _advice(matches: Matches, views: dict[str, CheckedView], is_opengl: bool) -> str:
