@@ -70,7 +70,7 @@ def test_outputs_are_listed_without_images(monkeypatch: pytest.MonkeyPatch, caps
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(OUTPUTS)
 
 
-def test_the_front_door(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_front_door(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     def said(program: str, *words: str) -> str:
         monkeypatch.setattr(sys, "argv", [program, *words])
         with suppress(SystemExit):
@@ -84,6 +84,10 @@ def test_the_front_door(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
     assert said("vg2gt", "trian") == "vg2gt: unknown command 'trian', did you mean train? (vg2gt --help lists all)\n"
     assert "did you mean splits?" in said("vg2gt data", "split")
     assert said("vg2gt", "zzz") == "vg2gt: unknown command 'zzz' (vg2gt --help lists all)\n"
+    monkeypatch.chdir(tmp_path)
+    Path("-1.jpg").touch()
+    said("vg2gt", "reconstruct", "-1.jpg", "--out", "o")
+    assert sys.argv[1:] == ["./-1.jpg", "--out", "o"]  # a file, no flag
 
 
 @pytest.fixture

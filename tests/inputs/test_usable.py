@@ -13,6 +13,7 @@ from vg2gt.data.base import DataError
 from vg2gt.inputs.cameras import pictures_for
 from vg2gt.inputs.pictures import find_pictures
 from vg2gt.inputs.usable import usable_pictures
+from vg2gt.io import write_video
 from vg2gt.monitor import Monitor
 
 SHAPE = (96, 144)
@@ -134,6 +135,18 @@ def test_versions_of_a_photograph_are_left_out(tmp_path: Path, caplog) -> None:
     assert names == {"IMG_7-1.jpg", "slow.jpg", *(f"{place}{number}.jpg" for place in places for number in range(4))}
     assert f"shows the same as {tmp_path / 'IMG_0.jpg'}" in caplog.text
     assert "IMG_7 is blurred" in caplog.text
+
+
+def test_repeated_frames_of_a_video_are_left_out(tmp_path: Path, caplog) -> None:
+    """As of videos that were converted to more frames per second; 24 of them took three times as long as 8."""
+    pytest.importorskip("av")
+    wide = scenery(1, (96, 200))
+    frames = [wide[:, 8 * number : 8 * number + 144] for number in range(4)]
+    path = write_video(tmp_path / "walk.mp4", [frame for frame in frames for _ in range(3)])
+    found = usable_pictures(find_pictures(path), Monitor())
+    assert [int(picture.name[-6:]) // 3 for picture in found] == [0, 1, 2, 3]
+    assert "8 of 12 images are left out: " in caplog.text
+    assert "walk-000001 repeats the frame before" in caplog.text
 
 
 def test_stereo_pairs_are_said(tmp_path: Path, caplog) -> None:

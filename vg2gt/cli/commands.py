@@ -7,6 +7,7 @@ import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
+from pathlib import Path
 
 import vg2gt
 
@@ -95,7 +96,8 @@ def dispatch(program: str, commands: Mapping[str, Command]) -> None:
     module, function = (*program.split()[1:], asked, "main")[:2]
     command = importlib.import_module(f"vg2gt.cli.{module}")
     # DDP starts further processes from argv: argv[0] must be the command's own file, and its name must not follow
-    sys.argv[:2] = [str(command.__file__)]
+    rest = [f"./{each}" if each[0:1] == "-" and Path(each).exists() else each for each in sys.argv[2:]]  # no flags
+    sys.argv[:] = [str(command.__file__), *rest]
     getattr(command, function)()
 
 

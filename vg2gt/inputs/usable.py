@@ -38,6 +38,7 @@ _COARSE = (4, 16)  # pixels of structures that blur leaves
 _BLURRED = 0.03  # least detail of 1 pixel in the worst direction, relative to the coarse one and to the images' median
 _SHOWN = 0.001  # share of the pixels that a mask shows at least
 _WIDE, _HALF, _PAIR = 1.7, 32, 0.9  # shape of stereo pairs, pixels of a half, least correlation of the halves
+_REPEATED = 0.3  # mean difference of 255 of a video's frame from the one before, up to which it is the same
 _FEWEST = 3  # images that are compared with each other
 _BORDER, _LIT = 6, 24  # values of 255 of a border at most, and of the image next to it at least
 _BORDERS = (0.001, 0.6)  # least and largest share of the pixels
@@ -111,7 +112,7 @@ def usable_pictures(pictures: Sequence[Picture], monitor: Monitor) -> list[Pictu
     looks: dict[str, _Look] = {}
     faults: dict[str, str] = {}
     borders: dict[tuple[int, int], _Borders] = {}
-    versions = Versions(pictures)
+    versions, before = Versions(pictures), np.zeros((0, 0, 3), np.uint8)
     with monitor.stage("check images", len(pictures)) as advance:
         for picture in pictures:
             try:
@@ -121,6 +122,9 @@ def usable_pictures(pictures: Sequence[Picture], monitor: Monitor) -> list[Pictu
             else:
                 if shown < _SHOWN:
                     faults[picture.name] = "is hidden by its mask (white in masks is what counts)"
+                if picture.container is not None and _repeats(pixels, before):
+                    faults[picture.name] = "repeats the frame before"
+                before = pixels
                 versions.add(picture, pixels)
                 looks[picture.name] = _look(pixels)
                 if _may_have_borders(picture):
@@ -161,6 +165,11 @@ def _small(picture: Picture) -> tuple[NDArray[np.uint8], float]:
     pixels = to_bytes(frames.images[0]).permute(1, 2, 0).numpy()
     shown = 1.0 if frames.mask is None else float(frames.mask.mean())
     return np.asarray(Image.fromarray(pixels).resize((width, height), Image.Resampling.BOX)), shown
+
+
+def _repeats(pixels: NDArray[np.uint8], before: NDArray[np.uint8]) -> bool:
+    """Returns whether a picture is the one before, as in videos that were converted to more frames per second."""
+    return pixels.shape == before.shape and float(np.abs(pixels - before.astype(float)).mean()) <= _REPEATED
 
 
 def _look(pixels: NDArray[np.uint8]) -> _Look:
