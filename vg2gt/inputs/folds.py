@@ -10,7 +10,6 @@ are removed. Where nothing surrounds the sides, images whose matches contradict 
 from __future__ import annotations
 
 import shutil
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence, Set
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -40,6 +39,7 @@ _FOUND = 2  # matches in a cell that a pair covers
 _COVERED = 0.5  # of the cells that the best pair of either image covers: the first models are made of such pairs
 _MOST = 0.5  # of a pair's matches, that must fit the cameras
 _FEWEST_FALSE = 3  # pairs of different places, below which nothing is removed
+_MISLED = 0.5  # different pairs per pair that looks alike, below which nothing is removed
 _FEWEST_UNDECIDED = 0.1  # of the placed images, and at least three of them
 _ROUNDS = 3  # models of pairs that cover most, until none differs
 
@@ -268,17 +268,14 @@ def _verdicts(models: Sequence[Reconstruction], matches: Matches) -> dict[tuple[
     return verdict
 
 
-def _telling(verdict: Mapping[tuple[str, str], bool]) -> int:
-    """Returns the number of pairs that show different places, without those of images that mostly look alike.
+def _is_folded(verdict: Mapping[tuple[str, str], bool]) -> bool:
+    """Returns whether so many pairs show different places that a model may be folded.
 
-    Of an orbit around equal sides, three times as many pairs or more differ as look alike; where all is right, a third
-    as many in a kitchen, a tenth around a tree.
+    As many differ as look alike around an object of two equal sides, three times as many or more with more of them.
+    Where all is right, a third as many do in a kitchen, a tenth around a tree.
     """
-    differ, alike = Counter[str](), Counter[str]()
-    for pair, same in verdict.items():
-        (alike if same else differ).update(pair)
-    misplaced = {name for name, count in differ.items() if count > 1 and count >= 2 * alike[name]}
-    return sum(not (same or misplaced.isdisjoint(pair)) for pair, same in verdict.items())
+    differ = sum(not alike for alike in verdict.values())
+    return differ >= max(_FEWEST_FALSE, _MISLED * (len(verdict) - differ))
 
 
 def _differing(models: Sequence[Reconstruction], matches: Matches) -> set[tuple[str, str]]:
@@ -400,7 +397,7 @@ def unfold(
     """
     verdict = _verdicts(models, matches)
     undecided: set[str] = set()
-    if _telling(verdict) >= _FEWEST_FALSE:
+    if _is_folded(verdict):
         everything, count = database.with_suffix(".all"), len(models[0].images)
         shutil.copyfile(database, everything)
 
