@@ -85,7 +85,7 @@ def test_photographs_are_refined_unless_asked_not_to(scene: Scene) -> None:
     photographs = replace(scene, cameras_from="structure from motion, 4 of 4 images")
     assert refined_by_default(photographs)
     normal = refinement_for(photographs)
-    assert (normal.steps, normal.rates.cameras, normal.min_views) == (300, 0.0, 3)
+    assert (normal.steps, normal.rates.cameras, normal.min_views) == (240, 0.0, 3)
     assert refinement_for(photographs, "draft").full is None
     normal_full, high_full = normal.full, refinement_for(photographs, "high").full
     assert high_full.steps > 3 * normal_full.steps

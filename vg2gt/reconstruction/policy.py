@@ -36,7 +36,7 @@ def refinement_for(
     Args:
         scene: the scene. Recordings are refined by ``configs/refine/default.yaml``, all others by
             ``photographs.yaml``, ``draft.yaml`` or ``high.yaml``, according to ``quality``.
-        quality: ``draft`` stays at the working size; ``high`` takes five times as many steps at full size
+        quality: ``draft`` stays at the working size; ``high`` takes eight times as many steps at full size
             as ``normal``.
         overrides: Hydra overrides: ``refine=NAME`` and ``refine.key=value``.
         **changes: options that are set after the overrides unless they are None, such as ``seconds``, which alone

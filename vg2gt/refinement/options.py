@@ -232,7 +232,7 @@ class FullSizeOptions:
     """
 
     size: int = 1600
-    steps: int = 600
+    steps: int = 480
     renderings: float = 40.0
     crop: int = 320
     coarse: float = 0.5
