@@ -60,7 +60,8 @@ def leaves(sample: Sample) -> tuple[Sample, list[Tensor]]:
     """The same sample, and the tensors of the prediction to which gradients flow."""
     geometry = sample.prediction.geometry
     depth, conf = (t.clone().requires_grad_() for t in (geometry.depth, geometry.depth_conf))
-    render = {name: tensor.clone().requires_grad_() for name, tensor in vars(sample.rendered).items()}
+    images = {name: image for name, image in vars(sample.rendered).items() if image is not None}
+    render = {name: image.clone().requires_grad_() for name, image in images.items()}
     return sample.with_depth(depth, conf).with_render(**render), [depth, conf, *render.values()]
 
 
