@@ -8,8 +8,9 @@ import pytest
 
 from tests.inputs.match_database import Dots, box, floor, orbit, write_database
 from vg2gt.inputs import folds, sfm
-from vg2gt.inputs.folds import Matches, _covering, contradicted_images, unfold
+from vg2gt.inputs.folds import _covering, contradicted_images, unfold
 from vg2gt.inputs.motion import check_motion, why_not_placed
+from vg2gt.inputs.pair_evidence import Matches
 from vg2gt.io.colmap import quiet_colmap
 from vg2gt.monitor import Monitor
 
