@@ -154,7 +154,7 @@ def test_stereo_pairs_are_said(tmp_path: Path, caplog) -> None:
     for number in range(3):
         wide = scenery(number, (90, 240))
         pair = np.concatenate((wide[:, 8:136], wide[:, :128])[:: 1 - 2 * (number % 2)], 1)
-        for name, pixels in (("pair", pair), ("wide", wide), ("flat", np.full_like(wide, 90))):
+        for name, pixels in (("pair", pair), ("wide", wide), ("flat", np.full_like(wide, 90 + number))):
             (tmp_path / name).mkdir(exist_ok=True)
             Image.fromarray(pixels).save(tmp_path / name / f"{number}.png")
     usable_pictures(find_pictures(tmp_path / "wide"), Monitor())
@@ -203,14 +203,14 @@ def test_pictures_without_a_visible_pixel_or_with_a_broken_mask(tmp_path: Path, 
 
 
 def test_nothing_left_is_an_error(tmp_path: Path) -> None:
-    for name in ("a.png", "b.png"):
-        Image.fromarray(np.zeros((*SHAPE, 3), np.uint8)).save(tmp_path / name)
+    for value, name in enumerate(("a.png", "b.png")):
+        Image.fromarray(np.full((*SHAPE, 3), value, np.uint8)).save(tmp_path / name)
     with pytest.raises(DataError, match="none of the 2 images can be used: a is black; b is black"):
         usable_pictures(find_pictures(tmp_path), Monitor())
     with pytest.raises(DataError, match="the only image b is black"):
         usable_pictures(find_pictures(tmp_path / "b.png"), Monitor())
-    for name in ("a.png", "b.png"):
-        Image.fromarray(scenery(0)).save(tmp_path / name)
+    for number, name in enumerate(("a.png", "b.png")):
+        Image.fromarray(scenery(number)).save(tmp_path / name)
         spoil(tmp_path / name, "cut")
     with pytest.raises(DataError, match=r"none of the 2 images can be used: a cannot be read \(.*; b cannot be read"):
         usable_pictures(find_pictures(tmp_path), Monitor())

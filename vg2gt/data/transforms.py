@@ -73,11 +73,28 @@ def crop(frames: Frames, top: int, left: int, size: tuple[int, int]) -> Frames:
 def resize_to_cover(frames: Frames, size: tuple[int, int]) -> Frames:
     """Resizes frames until they cover ``size`` (height, width), keeping their aspect ratio, and crops the centre."""
     height, width = frames.depth.shape[-2:]
-    scale = max(size[0] / height, size[1] / width)
     # Rounding to whole pixels changes the two scales slightly; resize() applies the actual ones to the intrinsics.
-    covering = tuple(max(least, _whole(side * scale)) for least, side in zip(size, (height, width), strict=True))
-    resized = resize(frames, (covering[0], covering[1]))
-    return crop(resized, (covering[0] - size[0]) // 2, (covering[1] - size[1]) // 2, size)
+    covering, (top, left) = covering_size((height, width), size)
+    return crop(resize(frames, covering), top, left, size)
+
+
+def covering_size(photo: tuple[int, int], size: tuple[int, int]) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Returns the size to which :func:`resize_to_cover` resizes a photograph; first row and column of its crop."""
+    scale = max(size[0] / photo[0], size[1] / photo[1])
+    height, width = (max(least, _whole(side * scale)) for least, side in zip(size, photo, strict=True))
+    return (height, width), ((height - size[0]) // 2, (width - size[1]) // 2)
+
+
+def photo_intrinsics(intrinsics: Tensor, size: tuple[int, int], photo: tuple[int, int]) -> Tensor:
+    """Returns the intrinsics of a whole photograph from those of its view.
+
+    Args:
+        intrinsics: ``[3, 3]`` of the view.
+        size: height and width of the view.
+        photo: height and width of the photograph.
+    """
+    covering, (top, left) = covering_size(photo, size)
+    return resize_intrinsics(crop_intrinsics(intrinsics, -left, -top), photo[1] / covering[1], photo[0] / covering[0])
 
 
 def reduce_to_fit(frames: Frames, size: tuple[int, int]) -> Frames:

@@ -8,14 +8,13 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 
 from vg2gt.data.base import DataError
 from vg2gt.data.sources.masks import AmbiguousMaskError
 from vg2gt.inputs.camera_check import check_cameras
-from vg2gt.inputs.distinct import without_copies
 from vg2gt.inputs.foreign import unread_camera_files
 from vg2gt.inputs.given_cameras import LAYOUTS, describe, given_pictures
 from vg2gt.inputs.pictures import ImagesLike, Picture, as_items, check_pictures, find_pictures
@@ -25,6 +24,7 @@ from vg2gt.io.errors import FormatError, some
 from vg2gt.io.files import by_number
 from vg2gt.model import Reconstructor
 from vg2gt.monitor import Monitor
+from vg2gt.types import check_choice
 
 log = logging.getLogger(__name__)
 
@@ -57,8 +57,7 @@ def pictures_for(
         monitor: shows and times the stages.
 
     Yields:
-        The pictures; of identical files, only the first. Those that show nothing are left out
-        (:func:`~vg2gt.inputs.usable.usable_pictures`).
+        The pictures that are of use (:func:`~vg2gt.inputs.usable.usable_pictures`).
 
     Raises:
         FileNotFoundError: if a path does not exist.
@@ -67,8 +66,7 @@ def pictures_for(
             backbone takes none.
     """
     backend = model.backend
-    if poses not in get_args(Poses):
-        raise ValueError(f"poses is {poses!r}; choose one of {', '.join(get_args(Poses))}")
+    check_choice("poses", poses, Poses)
     if poses != "auto" and not backend.needs_hints:
         raise ValueError(
             f"backend {backend.name} predicts its own cameras and accepts none: omit --poses, or use a backend that "
@@ -78,13 +76,13 @@ def pictures_for(
         raise ValueError(f"backend {backend.name} works from the depth and poses of a recording; leave --poses out")
     monitor = monitor or Monitor()
     if not backend.needs_hints:
-        yield usable_pictures(without_copies(find_pictures(images, max_images)), monitor)
+        yield usable_pictures(find_pictures(images, max_images), monitor)
         return
     given = None
     if poses != "sfm":
         given = _given_pictures(images, max_images, backend.needs_depth, poses)
     if given is not None:
-        usable = usable_pictures(without_copies(given), monitor)
+        usable = usable_pictures(given, monitor)
         if not backend.needs_depth:
             _check_places(usable)
             check_cameras(usable, monitor, insisted=poses == "given")
@@ -99,7 +97,7 @@ def pictures_for(
     if poses == "auto":
         _name_unread(images)
     with tempfile.TemporaryDirectory(prefix="vg2gt-sfm-") as temporary:
-        pictures = usable_pictures(without_copies(find_pictures(images, max_images)), monitor)
+        pictures = usable_pictures(find_pictures(images, max_images), monitor)
         place = {picture.name: number for number, picture in enumerate(pictures)}
         if all(picture.path is not None for picture in pictures):  # so that the order of the files does not matter
             pictures = sorted(pictures, key=lambda picture: by_number(str(picture.path)))

@@ -23,7 +23,7 @@ from vg2gt.geometry.cameras import resize_intrinsics
 from vg2gt.inputs.camera_files import cameras_of_json
 from vg2gt.inputs.damaged import read_each
 from vg2gt.inputs.distinct import with_unique_names
-from vg2gt.inputs.folders import image_files, image_folders, is_photo
+from vg2gt.inputs.folders import image_files, image_folders
 from vg2gt.inputs.foreign import camera_files_in, foreign_cameras
 from vg2gt.inputs.pictures import (
     UNKNOWN_LENS,
@@ -36,6 +36,7 @@ from vg2gt.inputs.pictures import (
     mask_for,
     shrunk,
 )
+from vg2gt.inputs.recordings import recording_pictures
 from vg2gt.io.cameras_json import NamedCamera, Photo
 from vg2gt.io.errors import FormatError, some
 from vg2gt.io.files import composed, read_json
@@ -87,55 +88,6 @@ def given_pictures(images: ImagesLike, max_images: int | None = None, depth: boo
             return None
         found += own if files is None else _only(own, files, folder)
     return with_unique_names(evenly(found, max_images))
-
-
-def recording_pictures(source: FileSource, with_tests: bool = False) -> list[Picture]:
-    """Returns the pictures of a source's only scene, with their cameras and depth, each at its own size.
-
-    Args:
-        source: the source.
-        with_tests: also return the test frames of Blender's sets.
-
-    Raises:
-        ValueError: if the source has several scenes.
-    """
-    if len(source.scenes) > 1:
-        raise ValueError(f"there are {len(source.scenes)} recordings; give one of them: {', '.join(source.scenes)}")
-    scene = source.scenes[0]
-    source.leave_out_damaged = True
-    index = source.scene_index(scene)
-    metric = source.is_metric or (isinstance(source, RGBDFolder) and (index.folder / "depth").is_dir())
-    recorded = metric or not isinstance(source, RGBDFolder) or app_of(index.folder) is not None
-    kind = f"{type(source).__name__ if recorded else 'poses'} {index.folder}"
-
-    def picture(frame: int) -> Picture:
-        """Returns a frame as a picture that is read on demand."""
-
-        def read(size: tuple[int, int]) -> Frames:
-            return source.load_whole(scene, frame, size)
-
-        row = index.row(frame)
-        color = index.color[row]
-        depths = points = None
-        if isinstance(source, COLMAP):
-            depths, points = source.point_depths(scene, frame), source.sound_points(scene, frame)
-        return Picture(
-            color.stem,
-            index.own_size(row),
-            read,
-            kind,
-            source.has_depth,
-            depths,
-            points,
-            path=color if color.is_file() and is_photo(color) else None,
-            pose=index.world_to_camera[row],
-            intrinsics=index.intrinsics[row],
-            is_metric=metric,
-            lens=index.lens(row),
-        )
-
-    tests = set(source.held_out(scene)) if isinstance(source, Nerfstudio) and not with_tests else set()
-    return [picture(frame) for frame in source.frames(scene) if frame not in tests]
 
 
 def _by_folder(paths: Sequence[Path]) -> dict[Path, list[Path] | None]:

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from vg2gt.data.base import Frames
-from vg2gt.data.transforms import resize_to_cover
-from vg2gt.geometry.cameras import crop_intrinsics, resize_intrinsics
+from vg2gt.data.transforms import photo_intrinsics, resize_to_cover
+from vg2gt.geometry.cameras import crop_intrinsics
 from vg2gt.inputs.pictures import Picture
 from vg2gt.io.cameras_json import NamedCamera, Photo
 from vg2gt.monitor import Monitor
@@ -100,25 +100,6 @@ def photo_of(camera: NamedCamera, picture: Picture) -> Photo:
     (height, width), (rows, columns) = (picture.whole or picture).size, picture.size
     matrix = crop_intrinsics(matrix, (columns - width) // 2, (rows - height) // 2)
     return Photo(name, width, height, matrix.numpy(), picture.lens)
-
-
-def photo_intrinsics(intrinsics: Tensor, size: tuple[int, int], photo: tuple[int, int]) -> Tensor:
-    """Returns the intrinsics of a whole photograph from those of its view.
-
-    Args:
-        intrinsics: ``[3, 3]`` of the view.
-        size: height and width of the view.
-        photo: height and width of the photograph.
-    """
-    covering, (top, left) = covering_size(photo, size)
-    return resize_intrinsics(crop_intrinsics(intrinsics, -left, -top), photo[1] / covering[1], photo[0] / covering[0])
-
-
-def covering_size(photo: tuple[int, int], size: tuple[int, int]) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Returns the size to which ``resize_to_cover`` resizes a photograph, and the first row and column of its crop."""
-    scale = max(size[0] / photo[0], size[1] / photo[1])
-    height, width = (max(least, math.floor(side * scale + 0.5)) for least, side in zip(size, photo, strict=True))
-    return (height, width), ((height - size[0]) // 2, (width - size[1]) // 2)
 
 
 def source_of(pictures: Sequence[Picture]) -> str:

@@ -35,11 +35,12 @@ from vg2gt.data.sources.undistortion import lens_text
 from vg2gt.data.transforms import reduce_to_fit, to_bytes
 from vg2gt.inputs.distinct import digest
 from vg2gt.inputs.folds import unfold
-from vg2gt.inputs.given_cameras import LAYOUTS, SFM_STATE, recording_pictures
+from vg2gt.inputs.given_cameras import LAYOUTS, SFM_STATE
 from vg2gt.inputs.likely_pairs import likely_pairs
 from vg2gt.inputs.motion import check_motion, why_not_placed
 from vg2gt.inputs.pair_evidence import Matches
 from vg2gt.inputs.pictures import SFM_SOURCE, UNKNOWN_LENS, Picture
+from vg2gt.inputs.recordings import recording_pictures
 from vg2gt.io.colmap import EXTRA, quiet_colmap
 from vg2gt.io.errors import FormatError, some
 from vg2gt.io.files import read_json, whole_folder, write_json

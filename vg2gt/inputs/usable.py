@@ -20,7 +20,7 @@ from vg2gt.data.base import DataError, Frames
 from vg2gt.data.sources.masks import joined_masks, resized_mask
 from vg2gt.data.transforms import to_bytes
 from vg2gt.inputs.damaged import name_left_out, reason_of
-from vg2gt.inputs.distinct import Versions
+from vg2gt.inputs.distinct import Versions, without_copies
 from vg2gt.inputs.pictures import IN_MEMORY, Picture
 from vg2gt.io.errors import some
 from vg2gt.io.images import curvatures
@@ -96,9 +96,9 @@ class _Borders:
 
 
 def usable_pictures(pictures: Sequence[Picture], monitor: Monitor) -> list[Picture]:
-    """Returns the pictures that can be read and show something; those left out are named in a warning.
+    """Returns the pictures that can be read and show something; of identical files, only the first.
 
-    Black borders, which undistorted photographs have, are masked.
+    Those left out are named in a warning. Black borders, which undistorted photographs have, are masked.
 
     Args:
         pictures: the pictures; each is decoded once, at a small size. Long videos are not looked at.
@@ -107,8 +107,9 @@ def usable_pictures(pictures: Sequence[Picture], monitor: Monitor) -> list[Pictu
     Raises:
         ValueError: if none is left.
     """
+    pictures = without_copies(pictures)
     if sum(picture.container is not None for picture in pictures) > IN_MEMORY:
-        return list(pictures)
+        return pictures
     looks: dict[str, _Look] = {}
     faults: dict[str, str] = {}
     borders: dict[tuple[int, int], _Borders] = {}

@@ -9,9 +9,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from vg2gt.data.transforms import resize_to_cover, to_bytes
+from vg2gt.data.transforms import covering_size, photo_intrinsics, resize_to_cover, to_bytes
 from vg2gt.geometry.cameras import crop_intrinsics, invert_rigid, resize_intrinsics
-from vg2gt.inputs.inputs import covering_size, photo_intrinsics
 from vg2gt.inputs.pictures import Picture
 from vg2gt.monitor import Monitor
 from vg2gt.refinement import Photographs
