@@ -15,10 +15,7 @@ class Mine(FileSource):
     """RGB-D scenes; ``cameras.json`` has ``K`` (3x3, integer pixel centres) and camera-to-world ``poses`` by frame."""
 
     layout = "SCENE/{rgb,depth,cameras.json}"  # shown in messages
-
-    def find(self, root: Path) -> dict[str, Path]:
-        """Returns the scene folders by name."""
-        return {path.parent.name: path.parent for path in sorted(root.glob("*/cameras.json"))}
+    scene_marks = ("rgb", "cameras.json")  # in the folder of a scene
 
     def index(self, scene: str, folder: Path) -> SceneIndex:
         """Lists the frames of a scene; does not decode images."""

@@ -71,7 +71,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--calibration", metavar="FILE", help="calibration of the stated errors; default: next to the checkpoint")
     add = parser.add_argument_group("refinement of up to 100 photographs, on by default").add_argument
     add("--quality", choices=("draft", "normal", "high"), default="normal", metavar="NAME", help="draft (working size "
-        "only), normal (default: then at the photographs' own size) or high (with five times the steps)")  # fmt: skip
+        "only), normal (default: then at the photographs' own size) or high (with six times the steps)")  # fmt: skip
     add("--refine", type=int, metavar="N", help="refine any scene for N steps at the working size only; 0: not at all")
     add("--watch", action="store_true", help=WATCH)
     add = parser.add_argument_group("what to keep").add_argument

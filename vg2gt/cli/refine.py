@@ -23,7 +23,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     add = arguments.add_argument
     add("scene", metavar="DIR", help="a folder that vg2gt reconstruct has written")
     add("--out", metavar="DIR", help="where to write; default: refined/ in the scene's folder")
-    add("--steps", type=int, metavar="N", help="number of steps; default: 12 per view, 400 for photos")
+    add("--steps", type=int, metavar="N", help="number of steps; default: 12 per view, 240 for photographs")
     add("--seconds", type=float, metavar="S", help="stop after S seconds, or after --steps if that comes first")
     add("--holdout", type=int, metavar="N", help="exclude every N-th view and print its PSNR before and after")
     add("--watch", action="store_true", help=WATCH)
