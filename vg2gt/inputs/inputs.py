@@ -30,13 +30,11 @@ class Views:
 
     Attributes:
         images: ``[V, 3, H, W]`` float32 in [0, 1], on the CPU.
-        names: one per view, unique.
         hints: known inputs, on the CPU: at least the order of the pictures.
         mask: ``[V, H, W]`` float32 in [0, 1], pixel weights (alpha, mask images); None: all pixels count.
     """
 
     images: Tensor
-    names: tuple[str, ...]
     hints: Hints
     mask: Tensor | None = None
 
@@ -90,7 +88,7 @@ def load_views(pictures: Sequence[Picture], size: tuple[int, int], monitor: Moni
         cameras = Cameras(given_poses(pictures, map_shift(pictures))[None], joined.intrinsics[None], size)
         depth = joined.depth[None] if all(picture.has_depth for picture in pictures) else None
         hints = Hints(depth, cameras, (source,), hints.frame_ids, depth_range(pictures), mask)
-    return Views(joined.images, tuple(picture.name for picture in pictures), hints, joined.mask)
+    return Views(joined.images, hints, joined.mask)
 
 
 def photo_of(camera: NamedCamera, picture: Picture) -> Photo:

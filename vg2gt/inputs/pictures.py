@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -52,8 +52,6 @@ from vg2gt.io.video import VIDEO_SUFFIXES, VideoFrames, count_frames, require_py
 log = logging.getLogger(__name__)
 
 ImagesLike: TypeAlias = "str | Path | Image.Image | NDArray[Any] | Tensor | Sequence[Any]"
-
-T = TypeVar("T")
 
 _OF_SEVERAL = (".tif", ".tiff", ".png", ".webp", ".avif")  # files of pages or animations; MPO's others are previews
 _ARCHIVES = (".7z", ".gz", ".rar", ".tar", ".tgz", ".zip")

@@ -85,7 +85,6 @@ def load_model(
     backend: str | None = None,
     overrides: Sequence[str] = (),
     device: str = "auto",
-    seed: int = 0,
 ) -> LoadedModel:
     """Builds a model from the configuration of its run and loads the trained weights.
 
@@ -97,7 +96,6 @@ def load_model(
         overrides: command-line overrides. ``backend=NAME``, ``model=NAME`` and ``renderer=NAME`` replace a part of the
             run's configuration; ``backend.key=value`` and the like change one key.
         device: ``auto``, ``cpu``, ``cuda`` or ``cuda:N``.
-        seed: seed of the untrained head.
 
     Returns:
         The model in eval mode, its renderer and the origin of its weights.
@@ -109,7 +107,7 @@ def load_model(
     """
     checkpoint, parts = _model_parts(ckpt, [*([f"backend={backend}"] if backend else []), *overrides])
     try:
-        built = build_model(parts, seed, choose_device(device))
+        built = build_model(parts, 0, choose_device(device))
         renderer: Renderer = instantiate(parts["renderer"])
     except HydraException as error:
         # Raise the constructor's own error: Hydra's message around it names internal classes.
