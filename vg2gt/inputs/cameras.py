@@ -18,8 +18,9 @@ from vg2gt.inputs.camera_check import check_cameras
 from vg2gt.inputs.foreign import unread_camera_files
 from vg2gt.inputs.given_cameras import LAYOUTS, describe, given_pictures
 from vg2gt.inputs.pictures import ImagesLike, Picture, as_items, check_pictures, find_pictures
-from vg2gt.inputs.sfm import find_cameras, require_pycolmap
+from vg2gt.inputs.sfm import OTHERWISE, PURPOSE, find_cameras
 from vg2gt.inputs.usable import usable_pictures
+from vg2gt.io.colmap import require_pycolmap
 from vg2gt.io.errors import FormatError, some
 from vg2gt.io.files import by_number
 from vg2gt.model import Reconstructor
@@ -123,7 +124,7 @@ def check_inputs(backend: type, images: Sequence[str], poses: Poses) -> None:
     check_pictures(images)
     needed = poses == "sfm" or getattr(backend, "needs_cameras", False)
     if needed and importlib.util.find_spec("pycolmap") is None and (poses == "sfm" or given_pictures(images) is None):
-        require_pycolmap()
+        require_pycolmap(PURPOSE, OTHERWISE)
 
 
 def _given_pictures(images: ImagesLike, max_images: int | None, depth: bool, poses: Poses) -> list[Picture] | None:

@@ -13,7 +13,6 @@ pinhole model fitted to a distorted lens gets a wrong focal length.
 from __future__ import annotations
 
 import hashlib
-import importlib.util
 import json
 import logging
 import shutil
@@ -41,7 +40,7 @@ from vg2gt.inputs.motion import check_motion, why_not_placed
 from vg2gt.inputs.pair_evidence import Matches
 from vg2gt.inputs.pictures import SFM_SOURCE, UNKNOWN_LENS, Picture
 from vg2gt.inputs.recordings import recording_pictures
-from vg2gt.io.colmap import EXTRA, quiet_colmap
+from vg2gt.io.colmap import quiet_colmap, require_pycolmap
 from vg2gt.io.errors import FormatError, some
 from vg2gt.io.files import read_json, whole_folder, write_json
 from vg2gt.monitor import Monitor
@@ -67,21 +66,12 @@ _PAIRS_AT_ONCE = 256  # pairs per call of the matcher, which indexes the feature
 _LARGE_ERROR = 1.1  # pixels, mean reprojection error of photographs that a lens model does not fit
 _MASKS = "masks"
 
-_OTHERWISE = f"or put camera files next to them ({LAYOUTS}), or use a backend that needs no cameras, such as da3_small"
+PURPOSE = "finding the cameras of photographs"
+OTHERWISE = f"or put camera files next to them ({LAYOUTS}), or use a backend that needs no cameras, such as da3_small"
 ADVICE = (
     "take more photographs, 20 or more, walking around the scene rather than turning on the spot, each overlapping "
-    f"the previous one by two thirds; {_OTHERWISE}"
+    f"the previous one by two thirds; {OTHERWISE}"
 )
-
-
-def require_pycolmap() -> None:
-    """Checks early that pycolmap is installed.
-
-    Raises:
-        ImportError: if it is not; the message names the remedies.
-    """
-    if importlib.util.find_spec("pycolmap") is None:
-        raise ImportError(f"finding the cameras of photographs needs pycolmap: {EXTRA}; {_OTHERWISE}")
 
 
 def find_cameras(pictures: Sequence[Picture], folder: Path, monitor: Monitor) -> list[Picture]:
@@ -106,7 +96,7 @@ def find_cameras(pictures: Sequence[Picture], folder: Path, monitor: Monitor) ->
     key = _key(pictures)
     state = _read_state(folder, key)
     if state is None:
-        require_pycolmap()
+        require_pycolmap(PURPOSE, OTHERWISE)
         if folder.exists() and any(folder.iterdir()) and not (folder / SFM_STATE).is_file():
             raise FileExistsError(f"{folder} already exists and contains other files; move it or choose another --out")
         if len(pictures) < 2:

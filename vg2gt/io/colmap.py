@@ -39,17 +39,19 @@ _FAR = 1e30  # larger values are as senseless as those that are not finite
 EXTRA = "pip install 'vg2gt[colmap]'"
 
 
-def require_pycolmap(purpose: str) -> None:
+def require_pycolmap(purpose: str, otherwise: str = "") -> None:
     """Checks early that pycolmap is installed.
 
     Args:
         purpose: what needs it; the error message starts with it.
+        otherwise: what to do instead; the message ends with it.
 
     Raises:
         ImportError: if it is not installed; the message has the command that installs it.
     """
     if importlib.util.find_spec("pycolmap") is None:
-        raise ImportError(f"{purpose} needs pycolmap: {EXTRA}")
+        remedy = f"{EXTRA}; {otherwise}" if otherwise else EXTRA
+        raise ImportError(f"{purpose} needs pycolmap: {remedy}")
 
 
 def colmap_files(folder: Path) -> dict[str, Path]:
