@@ -116,4 +116,16 @@ def test_cameras_in_one_place_see_in_the_same_direction(turn: int) -> None:
     pixels = [each[:, :2] / each[:, 2:] for each in shown]
     pose[:3, :3] = Rotation.from_euler("y", 10 * turn, degrees=True).as_matrix()
     views = [camera_check.CheckedView(intrinsics, each, (480, 640)) for each in (np.eye(4), pose)]
-    assert camera_check._fits(pixels, views).mean() == (turn == 1)
+    assert (camera_check._distance(pixels, views) < 0.02).mean() == (turn == 1)
+
+
+@pytest.mark.parametrize("factor", [0.8, 1.25])
+def test_a_wrong_focal_length_is_said(right: list[Picture], factor: float, monkeypatch, caplog) -> None:
+    matches, views = camera_check.match_pictures(right)
+    assert camera_check.better_focal(matches, views) is None
+    scale = np.array([[factor, 1, 1], [1, factor, 1], [1, 1, 1]])
+    wrong = {name: replace(view, intrinsics=view.intrinsics * scale) for name, view in views.items()}
+    assert camera_check.better_focal(matches, wrong) == pytest.approx(1 / factor, rel=0.06)
+    monkeypatch.setattr(camera_check, "match_pictures", lambda _: (matches, wrong))
+    check_cameras(right, Monitor())
+    assert "better with a focal length of about" in caplog.text

@@ -13,8 +13,8 @@ from vg2gt import io
 from vg2gt.data.sources.sparse_points import ObservedPoints
 from vg2gt.geometry.cameras import project
 from vg2gt.inputs.given_cameras import given_pictures
-from vg2gt.inputs.inputs import load_views, photo_of
-from vg2gt.inputs.padding import PADDED, of_one_shape, padded, without_padding
+from vg2gt.inputs.inputs import PADDED, load_views, photo_of, without_padding
+from vg2gt.inputs.padding import of_one_shape, padded
 from vg2gt.inputs.pictures import Picture
 from vg2gt.io.cameras_json import NamedCamera
 from vg2gt.monitor import Monitor

@@ -147,3 +147,23 @@ def test_a_long_video_is_decoded_when_it_is_read(tmp_path: Path, monkeypatch) ->
     for i in (0, 1, 5, 14, 3):
         assert torch.equal(lazy[i].read((32, 48)).images, whole[i].read((32, 48)).images)
     assert len(reads) == 2  # once in order, once again for the frame before
+
+
+def test_what_masks_of_objects_hide_looks_as_if_transparent(tmp_path: Path) -> None:
+    """Depth of the object was found by the room that its masks hid; before a scene that goes on, nothing changes."""
+    pixels = np.random.default_rng(0).integers(0, 255, (56, 84, 3), np.uint8)
+    shown = {"object": np.zeros((56, 84), np.uint8), "transient": np.full((56, 84), 255, np.uint8)}
+    shown["object"][10:40, 20:60], shown["transient"][10:40, 20:60] = 255, 0
+    for kind, mask in shown.items():
+        for folder in (f"{kind}-alpha", f"{kind}-file", f"{kind}-file/masks"):
+            (tmp_path / folder).mkdir()
+        Image.fromarray(np.dstack([pixels, mask])).save(tmp_path / f"{kind}-alpha" / "1.png")
+        Image.fromarray(pixels).save(tmp_path / f"{kind}-file" / "1.png")
+        Image.fromarray(mask).save(tmp_path / f"{kind}-file" / "masks" / "1.png")
+    found = {
+        folder.name: load_views(find_pictures(folder), (56, 84), Monitor()) for folder in sorted(tmp_path.iterdir())
+    }
+    assert torch.equal(found["object-file"].images, found["object-alpha"].images)
+    assert torch.equal(found["object-file"].mask, found["object-alpha"].mask)
+    plain = torch.from_numpy(pixels).permute(2, 0, 1) / 255
+    torch.testing.assert_close(found["transient-file"].images[0], plain)

@@ -36,6 +36,8 @@ _CONTRADICTED = 0.5  # share of the pairs that contradict the cameras, from whic
 _LOOKED_AT, _SMALL = 20, 320  # neighbours whose points are looked at, and the longer side of their images in pixels
 _COMMON = 30  # points of an image that others of these see, too
 _ALIKE = 0.5  # median correlation of their brightness, .92 and more in right models, below which images are others
+_FOCAL = np.geomspace(1 / 1.6, 1.6, 21)  # times the given focal length that are tried
+_NEAR, _BETTER = 0.0015, 0.5  # of the longer side, up to which features fit; and by which factor another length is better
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -79,6 +81,11 @@ def check_cameras(pictures: Sequence[Picture], monitor: Monitor, insisted: bool 
     with monitor.stage("check cameras"):
         matches, views = match_pictures(chosen)
     shares = fitting_shares(matches, views)
+    if (factor := better_focal(matches, views)) is not None:
+        log.warning(
+            "the images fit the cameras of %s better with a focal length of about %.2f times the given one: check it, "
+            "or find the cameras from the images by --poses sfm", pictures[0].source, factor,
+        )  # fmt: skip
     titles = {name: each.name for name, each in _numbered(chosen)}
     against = [f"{titles[one]} and {titles[other]}" for (one, other), share in shares.items() if share < _FITTING]
     if not against or len(shares) < min(_PAIRS, len(chosen) - 1):
@@ -178,6 +185,27 @@ def _staged(picture: Picture, file: Path) -> CheckedView:
 
 def fitting_shares(matches: Matches, views: dict[str, CheckedView]) -> dict[tuple[str, str], float]:
     """Returns the share of matches that fit the cameras, of every image's pair with most matches."""
+    return {pair: float((off < _WITHIN).mean()) for pair, off in _distances(matches, views).items()}
+
+
+def better_focal(matches: Matches, views: dict[str, CheckedView]) -> float | None:
+    """Returns the factor of all focal lengths with which matches fit much better; None if those given fit."""
+
+    def distance(factor: float) -> float:
+        scale = np.array([[factor, 1, 1], [1, factor, 1], [1, 1, 1]])
+        scaled = {name: replace(view, intrinsics=view.intrinsics * scale) for name, view in views.items()}
+        found = list(_distances(matches, scaled).values())
+        return float(np.median(np.minimum(np.concatenate(found), _WITHIN))) if found else 0.0
+
+    given = distance(1.0)
+    if given <= _NEAR:
+        return None
+    best = min(_FOCAL, key=distance)
+    return float(best) if distance(best) < _BETTER * given else None
+
+
+def _distances(matches: Matches, views: dict[str, CheckedView]) -> dict[tuple[str, str], NDArray[np.float64]]:
+    """Returns how far matches ``[m]`` are from where the cameras see one point, of every image's strongest pair."""
     strongest: dict[str, tuple[str, str]] = {}
     for pair, rows in matches.pairs.items():
         for name in pair if len(rows) >= _FEWEST else ():
@@ -187,12 +215,12 @@ def fitting_shares(matches: Matches, views: dict[str, CheckedView]) -> dict[tupl
     for pair in sorted(set(strongest.values())):
         rows = matches.pairs[pair]
         pixels = [matches.features[name][rows[:, side]] - PIXEL_CENTER for side, name in enumerate(pair)]
-        found[pair] = float(_fits(pixels, [views[name] for name in pair]).mean())
+        found[pair] = _distance(pixels, [views[name] for name in pair])
     return found
 
 
-def _fits(pixels: Sequence[NDArray[np.float64]], views: Sequence[CheckedView]) -> NDArray[np.bool_]:
-    """Returns which matches ``[m]`` two cameras see as one point in front of both."""
+def _distance(pixels: Sequence[NDArray[np.float64]], views: Sequence[CheckedView]) -> NDArray[np.float64]:
+    """Returns how far matches ``[m]`` are from one point, as a share of the longer side; inf if it is not in front."""
     rays, centers = [], []
     for points, view in zip(pixels, views, strict=True):
         turn = view.pose[:3, :3]
@@ -207,12 +235,13 @@ def _fits(pixels: Sequence[NDArray[np.float64]], views: Sequence[CheckedView]) -
     depths = [(along[0] + cosine * along[1]) / sine2, (along[1] + cosine * along[0]) / sine2]
     far = 1e6 * (np.linalg.norm(base) or 1.0)  # any distance will do for cameras in one place, as on a tripod
     parallel = sine2 < np.sin(np.radians(_PARALLEL)) ** 2
-    fits = np.ones(len(cosine), bool)
+    found = np.zeros(len(cosine))
     for one, other in ((0, 1), (1, 0)):
         points = centers[one] + np.where(parallel, far, depths[one])[:, None] * rays[one]
         local = points @ views[other].pose[:3, :3].T + views[other].pose[:3, 3]
         shown = local @ views[other].intrinsics.T
         with np.errstate(divide="ignore", invalid="ignore"):  # beside or in the camera: does not fit
             error = np.linalg.norm(shown[:, :2] / shown[:, 2:] - pixels[other], axis=1)
-        fits &= (local[:, 2] > 0) & (parallel | (depths[one] > 0)) & (error < _WITHIN * max(views[other].size))
-    return fits
+        in_front = (local[:, 2] > 0) & (parallel | (depths[one] > 0))
+        found = np.maximum(found, np.where(in_front, error / max(views[other].size), np.inf))
+    return found

@@ -20,6 +20,8 @@ from vg2gt.monitor import Monitor
 from vg2gt.types import Cameras, Hints
 
 LONGER_SIDE = {"cuda": 518, "cpu": 280}  # pixels, by device; foundation models are trained at about 518
+PADDED = 1e-3
+"""Mask of padding: hardly any weight, but unlike 0 it does not say that nothing is there (:func:`without_padding`)."""
 _FEWEST_POINTS = 20  # minimum observations of sparse points for a depth range
 _OUTLIERS, _NEARER, _FARTHER = 1, 0.8, 1.4  # percent cut at either end, widening factors
 
@@ -88,7 +90,26 @@ def load_views(pictures: Sequence[Picture], size: tuple[int, int], monitor: Moni
         cameras = Cameras(given_poses(pictures, map_shift(pictures))[None], joined.intrinsics[None], size)
         depth = joined.depth[None] if all(picture.has_depth for picture in pictures) else None
         hints = Hints(depth, cameras, (source,), hints.frame_ids, depth_range(pictures), mask)
-    return Views(joined.images, hints, joined.mask)
+    images = joined.images if joined.mask is None else cut_out(joined.images, joined.mask)
+    return Views(images, hints, joined.mask)
+
+
+def without_padding(mask: Tensor) -> Tensor:
+    """Returns masks in which padding counts as seen, for what concludes from a mask that nothing is there."""
+    return torch.where((mask - PADDED).abs() < PADDED / 2, 1.0, mask)
+
+
+def cut_out(images: Tensor, mask: Tensor) -> Tensor:
+    """Returns images ``[V, 3, H, W]`` in which masks ``[V, H, W]`` of objects hide what is around them.
+
+    It becomes white, as transparent pixels are, or depth would be found there by what the masks hide. Other masks,
+    which show most of the image's border, stand for things in front of a scene that goes on behind them.
+    """
+    seen = without_padding(mask)
+    border = torch.cat([seen[:, 0], seen[:, -1], seen[:, :, 0], seen[:, :, -1]], 1)
+    hidden = (border <= 0.5).float().mean(1) > 0.5
+    weights = torch.where(hidden[:, None, None], mask, 1.0)[:, None]
+    return images * weights + (1 - weights)
 
 
 def photo_of(camera: NamedCamera, picture: Picture) -> Photo:

@@ -7,16 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from torch import Tensor
 from torch.nn import functional as F
 
 from vg2gt.data.base import Frames
 from vg2gt.geometry.cameras import crop_intrinsics
-from vg2gt.inputs.inputs import working_size
+from vg2gt.inputs.inputs import PADDED, working_size
 from vg2gt.inputs.pictures import Picture
 
-PADDED = 1e-3
-"""Mask of padding: hardly any weight, but unlike 0 it does not say that nothing is there (:func:`without_padding`)."""
 LEAST_KEPT = 0.8  # share of a picture's area; one that would lose more to cropping is padded
 
 
@@ -50,11 +47,6 @@ def padded(picture: Picture, shape: tuple[int, int]) -> Picture:
         places = (points.places * picture.size[::-1] + corner) / size[::-1]
         points = replace(points, places=places)
     return replace(picture, size=size, read=read, intrinsics=matrix, points=points, whole=picture)
-
-
-def without_padding(mask: Tensor) -> Tensor:
-    """Returns masks in which padding counts as seen, for what concludes from a mask that nothing is there."""
-    return torch.where((mask - PADDED).abs() < PADDED / 2, 1.0, mask)
 
 
 def _canvas(size: tuple[int, int], shape: tuple[int, int]) -> tuple[int, int]:

@@ -20,7 +20,7 @@ from vg2gt.io.cameras_json import Fields, check_rigid
 from vg2gt.io.files import read_json, write_json
 
 PIXEL_CENTER = 0.5  # centre of the first pixel in the file; ours is at 0
-DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 _ANY, _POSITIVE, _ANGLE = (-math.inf, math.inf), (0, math.inf), (0, math.pi)
 _LIMITS = {
@@ -46,7 +46,7 @@ class Lens:
         camera_angle_x: full horizontal field of view in radians; ``fl_x`` takes precedence.
         camera_angle_y: full vertical field of view in radians; ``fl_y`` takes precedence.
         camera_model: name of the camera model, such as ``OPENCV`` or ``OPENCV_FISHEYE``.
-        distortion: OpenCV coefficients by name, among ``k1 k2 k3 k4 p1 p2``.
+        distortion: OpenCV coefficients by name, among ``k1 ... k6 p1 p2``.
     """
 
     width: int | None = None

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from vg2gt.geometry.cameras import unproject
-from vg2gt.inputs.padding import without_padding
+from vg2gt.inputs.inputs import without_padding
 from vg2gt.inputs.pictures import spread
 from vg2gt.method.additions.far_shell import far_shell
 from vg2gt.method.additions.hull import Meaning, meaning_of, outside_hull

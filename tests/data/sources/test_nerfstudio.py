@@ -57,7 +57,18 @@ def test_instant_ngps_fisheye_is_a_fisheye(tmp_path):
     assert torch.equal(found.images, right.images)
     assert torch.equal(found.intrinsics, right.intrinsics)
     _edit(tmp_path, lambda content: content.pop("is_fisheye"))
-    with pytest.raises(DataError, match="radial k4, which is supported for fisheye cameras only"):
+    with pytest.raises(DataError, match="distortion k4, which is not supported: set camera_model or is_fisheye"):
+        Nerfstudio(str(tmp_path)).load("desk", [0])
+
+
+@pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE"])
+def test_coefficients_that_are_not_read_are_named(tmp_path, model: str):
+    """A rational model of OpenCV was read without its k5 and k6."""
+    write(tmp_path, room(2))
+    _edit(tmp_path, lambda content: content.update(camera_model=model, k1=0.02, k5=0.0, k6=0.0))
+    Nerfstudio(str(tmp_path)).load("desk", [0])
+    _edit(tmp_path, lambda content: content.update(k5=0.01, k6=0.02))
+    with pytest.raises(DataError, match="distortion k5, k6, which is not supported"):
         Nerfstudio(str(tmp_path)).load("desk", [0])
 
 

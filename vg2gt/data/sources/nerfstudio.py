@@ -146,9 +146,11 @@ def _distorted(lens: Lens, matrix: NDArray[np.float64], size: Size, where: str) 
 
     k = lens.distortion
     fisheye = "FISHEYE" in (lens.camera_model or "").upper()
-    if not fisheye and k.get("k4"):
+    if unread := [name for name in ("k4", "k5", "k6")[fisheye:] if k.get(name)]:
+        remedy = "" if fisheye else "set camera_model or is_fisheye if it is a fisheye, which may have a k4, otherwise "
         raise DataError(
-            f"{where} has a radial k4, which is supported for fisheye cameras only: set camera_model or is_fisheye"
+            f"{where} has a distortion {', '.join(unread)}, which is not supported: {remedy}undistort the images "
+            "before, or calibrate with k1, k2, k3, p1 and p2 only"
         )
     names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
     coefficients = [k.get(name, 0.0) for name in names] + ([] if fisheye else [0.0] * 3)
