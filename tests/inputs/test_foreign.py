@@ -132,7 +132,7 @@ def distorted(camera: ForeignCamera, x: float, y: float) -> np.ndarray:
 
 @pytest.mark.parametrize("kind", ["frame", "fisheye"])
 @pytest.mark.parametrize("radial", [(-0.2, 0.07, -0.02, 0.0), (-0.15, 0.05, -0.02, 0.01)])
-def test_lenses_of_metashape(tmp_path: Path, kind: str, radial) -> None:
+def test_lenses_of_metashape(tmp_path: Path, kind: str, radial, caplog) -> None:
     """``p1`` and ``p2`` have the other order than OpenCV's, ``b1`` is the difference of the focal lengths."""
     pycolmap = pytest.importorskip("pycolmap")
     path = tmp_path / "cameras.xml"
@@ -144,12 +144,16 @@ def test_lenses_of_metashape(tmp_path: Path, kind: str, radial) -> None:
         f"{text_of(np.eye(4))}</transform></camera></cameras></chunk></document>"
     )
     (camera,) = read_photogrammetry(path)
+    assert not caplog.records
     assert camera.tangential == (-0.001, 0.002)
     assert camera.focal == (3004, 3000)
     model, params = camera.lens((3000, 4000))
     lens = pycolmap.Camera(model=model, width=4000, height=3000, params=params)
     for x, y in ((0.1, 0.2), (-0.6, 0.4), (0.5, -0.45), (0.01, -0.3)):
         np.testing.assert_allclose(lens.img_from_cam(np.array([[x, y, 1.0]]))[0], distorted(camera, x, y), atol=0.05)
+    path.write_text(path.read_text().replace("<p1>", "<p3>0.1</p3><b2>0.5</b2><p1>"))
+    read_photogrammetry(path)
+    assert "of a, p3 (tangential distortion) is ignored" in caplog.text
 
 
 def test_the_lens_of_visualsfm_undistorts_what_is_measured() -> None:

@@ -37,7 +37,10 @@ _LOOKED_AT, _SMALL = 20, 320  # neighbours whose points are looked at, and the l
 _COMMON = 30  # points of an image that others of these see, too
 _ALIKE = 0.5  # median correlation of their brightness, .92 and more in right models, below which images are others
 _FOCAL = np.geomspace(1 / 1.6, 1.6, 21)  # times the given focal length that are tried
-_NEAR, _BETTER = 0.0015, 0.5  # of the longer side, up to which features fit; and by which factor another length is better
+_NEAR, _BETTER = (
+    0.0015,
+    0.5,
+)  # of the longer side, up to which features fit; and by which factor another length is better
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 

@@ -175,8 +175,9 @@ def _of_sensor(path: Path, label: str, sensor: ElementTree.Element, pose: NDArra
     def value(name: str) -> float:
         return float(calibration.findtext(name) or 0)
 
-    if abs(value("b2")) > 1:
-        log.warning("%s: the skew (b2) of %s, %.2g pixels, is ignored", path, label, value("b2"))
+    unread = {"b2": "skew, of one pixel and more", "p3": "tangential distortion", "p4": "tangential distortion"}
+    if ignored := [f"{name} ({unread[name]})" for name in unread if abs(value(name)) > (1 if name == "b2" else 0)]:
+        log.warning("%s: of %s, %s is ignored: optimise the cameras without it", path, label, ", ".join(ignored))
     width, height = int(resolution.get("width", "")), int(resolution.get("height", ""))
     fy = value("f") or value("fy")
     return ForeignCamera(
