@@ -127,5 +127,5 @@ def test_a_wrong_focal_length_is_said(right: list[Picture], factor: float, monke
     wrong = {name: replace(view, intrinsics=view.intrinsics * scale) for name, view in views.items()}
     assert camera_check.better_focal(matches, wrong) == pytest.approx(1 / factor, rel=0.06)
     monkeypatch.setattr(camera_check, "match_pictures", lambda _: (matches, wrong))
-    check_cameras(right, Monitor())
+    check_cameras(right, Monitor(), insisted=True)  # whether or not it is wrong enough to be an error
     assert "better with a focal length of about" in caplog.text
