@@ -15,7 +15,7 @@ from PIL import Image
 
 from vg2gt.data.base import DataError
 from vg2gt.data.transforms import reduce_to_fit, to_bytes
-from vg2gt.inputs.folds import Matches
+from vg2gt.inputs.pair_evidence import Matches
 from vg2gt.inputs.pictures import Picture, spread
 from vg2gt.inputs.sfm import find_features, match_features
 from vg2gt.io.cameras_json import invert_pose

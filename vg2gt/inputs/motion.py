@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from vg2gt.inputs.folds import Matches, count_cells
+from vg2gt.inputs.pair_evidence import Matches, count_cells
 
 _MOVED = 0.01  # of the longer side: median shift of matched features if the camera moved at all
 _STILL = 0.0015  # of the longer side: shift of features that do not move
