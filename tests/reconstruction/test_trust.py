@@ -9,8 +9,10 @@ import pytest
 import torch
 import trimesh
 
+from tests.data.sources.layout_rgbd import write_recording
 from tests.reconstruction.conftest import run
 from vg2gt.cli import view as view_command
+from vg2gt.data import SyntheticScenes
 from vg2gt.geometry.cameras import unproject
 from vg2gt.io import read_gaussian_ply, write_gaussian_ply
 from vg2gt.io.ply import read_properties
@@ -67,6 +69,18 @@ def test_it_is_of_the_views_as_they_were_given() -> None:
     _, status = pixel_trust(prediction, [2, 0, 1], mask, None)
     assert (status == Status.GUESSED).nonzero().tolist() == [[0, 2, 3]]
     assert (status == Status.UNSEEN).nonzero().tolist() == [[2, 7, 7]]
+
+
+def test_views_with_cameras_of_others_are_named(ready, tmp_path, caplog) -> None:
+    source = SyntheticScenes(1, num_frames=8, size=(84, 112))
+    frames = source.load(source.scenes[0], range(8))
+    reconstruct_with(ready.model, write_recording(tmp_path, frames, "right"), renderer=ready.renderer)
+    assert not caplog.text
+    poses = frames.world_to_camera.clone()
+    poses[[2, 5]] = poses[[5, 2]]
+    swapped = write_recording(tmp_path, replace(frames, world_to_camera=poses), "swapped")
+    reconstruct_with(ready.model, swapped, renderer=ready.renderer)
+    assert [record.message.split(" contradict")[0] for record in caplog.records] == ["00012, 00015"]
 
 
 def test_files_carry_it_and_scenes_of_before_are_read(written: Path, stated: Scene, tmp_path: Path) -> None:

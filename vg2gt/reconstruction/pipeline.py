@@ -24,6 +24,7 @@ from vg2gt.inputs.folders import is_photo
 from vg2gt.inputs.inputs import Views, load_views
 from vg2gt.inputs.padding import of_one_shape
 from vg2gt.inputs.pictures import ImagesLike, Picture
+from vg2gt.io.errors import some
 from vg2gt.io.image_files import gps_position
 from vg2gt.memory import RECONSTRUCTION, memory_advice, note_sizes
 from vg2gt.model import Reconstructor
@@ -34,7 +35,7 @@ from vg2gt.reconstruction.policy import Quality, Refinement, check_refinement
 from vg2gt.reconstruction.refined import refined_by_policy
 from vg2gt.reconstruction.scene import Scene
 from vg2gt.reconstruction.surroundings import with_surroundings
-from vg2gt.reconstruction.trust import pixel_trust
+from vg2gt.reconstruction.trust import odd_views, pixel_trust
 from vg2gt.reconstruction.windows import WINDOWS
 from vg2gt.reconstruction.windows.run import WindowRun, device_of, window_model
 from vg2gt.reconstruction.windows.store import window_size
@@ -148,6 +149,11 @@ def reconstruct_with(
         else:
             parts = _at_once(model.eval(), load_views(pictures, target, monitor), monitor, calibration)
     scene = _scene(parts, pictures, renderer or Renderer(), model.backend.is_metric)
+    if parts.support is not None and (odd := odd_views(parts.support)):
+        log.warning(
+            "%s contradict the other images: their cameras may be wrong or belong to other images, or they show "
+            "something else; correct their cameras or leave them out", some([scene.names[view] for view in odd], 5),
+        )  # fmt: skip
     return with_surroundings(scene, model.visibility is not None).placed()
 
 

@@ -25,6 +25,7 @@ _DOUBTS = {
     "unseen": "are seen by no view (unseen)",
 }
 _FEW = 0.5  # share of confirmed Gaussians below which the summary gives advice; a round number, not tuned
+_ODD, _USUAL = 0.25, 0.2  # share of a view's pixels that contradict others from which it is odd, and of most views
 _GIVEN = (
     ", or the given cameras do not fit the images (axes of another convention, another order, inverted poses): --poses "
     "sfm ignores them"
@@ -52,6 +53,23 @@ def pixel_trust(
     if mask is not None:
         status[mask <= 0.5] = Status.UNSEEN
     return None if error is None else error.cpu()[back], status
+
+
+def odd_views(support: Tensor) -> list[int]:
+    """Returns the views that contradict the others, if most of these agree: their cameras may be those of other images.
+
+    With right cameras, at most about as many of a view's pixels contradicted others as agreed with them (four sets of
+    photographs). Of two images with each other's camera, 25 to 82 % contradict, and few agree.
+
+    Args:
+        support: ``[V, H, W]`` :class:`vg2gt.visibility.Status` of each pixel.
+    """
+    against, agreed = (
+        torch.stack([(view == kind).float().mean() for view in support])
+        for kind in (Status.CONTRADICTED, Status.AGREED)
+    )
+    odd = (against > _ODD) & (agreed < against / 2)
+    return odd.nonzero()[:, 0].tolist() if against.median() < _USUAL else []
 
 
 def trusted(scene: Scene, min_confidence: float | None = None, drop: Sequence[str] = ()) -> Scene:
