@@ -5,14 +5,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from tests.inputs.match_database import Dots, box, floor, orbit, write_database
 from vg2gt.inputs import folds, sfm
 from vg2gt.inputs.folds import _covering, contradicted_images, unfold
-from vg2gt.inputs.motion import check_motion, why_not_placed
+from vg2gt.inputs.motion import check_motion, check_parallax, why_not_placed
 from vg2gt.inputs.pair_evidence import Matches
-from vg2gt.io.colmap import quiet_colmap
+from vg2gt.io.colmap import colmap_from_views, quiet_colmap
 from vg2gt.monitor import Monitor
+from vg2gt.types import Cameras
 
 pytest.importorskip("pycolmap")
 COUNT = 16
@@ -118,6 +120,31 @@ def still(count: int, static: int, moving: int, shift: float) -> Matches:
 def test_a_camera_that_did_not_move_is_said(matches: Matches, said: str | None) -> None:
     with nullcontext() if said is None else pytest.raises(ValueError, match=said):
         check_motion(matches)
+
+
+def turned(step: float):
+    """A model of eight views that turn by 8 degrees and move by ``step``, 4 to 9 away from what they show."""
+    generator = np.random.default_rng(0)
+    points = generator.uniform((-5, -2, 4), (5, 2, 9), (300, 3))
+    angles = np.deg2rad(8 * np.arange(8) - 28)
+    poses = np.tile(np.eye(4), (8, 1, 1))
+    poses[:, 0, 0] = poses[:, 2, 2] = np.cos(angles)
+    poses[:, 0, 2], poses[:, 2, 0] = -np.sin(angles), np.sin(angles)
+    poses[:, :3, 3] = -poses[:, :3, 0] * step * np.arange(8)[:, None]
+    matrix = np.array([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]])
+    local = points @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]
+    shown = local @ matrix.T
+    pixels = shown[..., :2] / shown[..., 2:] + generator.normal(0, 0.3, (8, 300, 2))
+    view, point = ((local[..., 2] > 0) & (pixels > 0).all(-1) & (pixels < (640, 480)).all(-1)).nonzero()
+    cameras = Cameras(torch.tensor(poses)[None], torch.tensor(matrix).expand(1, 8, 3, 3), (480, 640))
+    names = [f"{number}.jpg" for number in range(8)]
+    return colmap_from_views(cameras, names, points, None, (point, view, pixels[view, point]))
+
+
+def test_a_turn_on_the_spot_is_said() -> None:
+    with pytest.raises(ValueError, match=r"only turned on the spot.*walk around"):
+        check_parallax(turned(0.0))
+    check_parallax(turned(0.2))
 
 
 @pytest.mark.parametrize(

@@ -36,7 +36,7 @@ from vg2gt.inputs.distinct import digest
 from vg2gt.inputs.folds import unfold
 from vg2gt.inputs.given_cameras import LAYOUTS, SFM_STATE
 from vg2gt.inputs.likely_pairs import likely_pairs
-from vg2gt.inputs.motion import check_motion, why_not_placed
+from vg2gt.inputs.motion import check_motion, check_parallax, why_not_placed
 from vg2gt.inputs.pair_evidence import Matches
 from vg2gt.inputs.pictures import SFM_SOURCE, UNKNOWN_LENS, Picture
 from vg2gt.inputs.recordings import recording_pictures
@@ -177,6 +177,7 @@ def _solve(pictures: Sequence[Picture], folder: Path, key: str, monitor: Monitor
             raise ValueError(
                 f"cannot find the cameras of these {len(pictures)} images: {why_not_placed(matches)}; {ADVICE}"
             )
+        check_parallax(models[0])
         folded = models
         models, undecided = unfold(work / "database.db", matches, models, lambda: _map(work, len(names), monitor))
         placed, *others = _parts(models)
