@@ -167,6 +167,7 @@ def test_what_cannot_be_written_is_named(tmp_path: Path) -> None:
         (header(3, ["x", "y", "z"]) + b"\0" * 35, "need 36 bytes, 35 are left"),
         (header(0, ["x", "y", "z"]), "vertices have no f_dc_0, f_dc_1, f_dc_2, only x, y, z"),
         (header(0, ["x", "packed_position"]), "splat-transform"),
+        (b"ply\nformat binary_little_endian 1.0\nelement chunk 178\nend_header\n", "compressed PLY; splat-transform"),
         (header(0, [*BEFORE_REST, *(f"f_rest_{i}" for i in range(10)), *AFTER_REST]), "10 f_rest properties, expected"),
     ],
 )

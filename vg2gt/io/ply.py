@@ -180,6 +180,8 @@ def _layout(path: Path, lines: list[list[str]]) -> tuple[np.dtype, int]:
                 count = int(text)
             case ["element", *_] if types:
                 break
+            case ["element", "chunk", *_]:
+                raise FormatError(f"{path}: a compressed PLY; splat-transform converts it to an ordinary one")
             case ["property", kind, name] if count >= 0 and kind in _TYPES and name not in types:
                 types[name] = order + _TYPES[kind]
             case _:
