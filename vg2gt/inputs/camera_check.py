@@ -37,10 +37,8 @@ _LOOKED_AT, _SMALL = 20, 320  # neighbours whose points are looked at, and the l
 _COMMON = 30  # points of an image that others of these see, too
 _ALIKE = 0.5  # median correlation of their brightness, .92 and more in right models, below which images are others
 _FOCAL = np.geomspace(1 / 1.6, 1.6, 21)  # times the given focal length that are tried
-_NEAR, _BETTER = (
-    0.0015,
-    0.5,
-)  # of the longer side, up to which features fit; and by which factor another length is better
+_NEAR = 0.0015  # of the longer side: median distance of matches up to which the given focal length fits
+_BETTER = 0.5  # share of that distance, below which another focal length is better
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -200,11 +198,10 @@ def better_focal(matches: Matches, views: dict[str, CheckedView]) -> float | Non
         found = list(_distances(matches, scaled).values())
         return float(np.median(np.minimum(np.concatenate(found), _WITHIN))) if found else 0.0
 
-    given = distance(1.0)
-    if given <= _NEAR:
+    if (given := distance(1.0)) <= _NEAR:
         return None
-    best = min(_FOCAL, key=distance)
-    return float(best) if distance(best) < _BETTER * given else None
+    least, best = min((distance(factor), float(factor)) for factor in _FOCAL)
+    return best if least < _BETTER * given else None
 
 
 def _distances(matches: Matches, views: dict[str, CheckedView]) -> dict[tuple[str, str], NDArray[np.float64]]:

@@ -23,7 +23,7 @@ _MANY, _GONE = 6, 0.05  # features of a cell in which nothing is still, and the 
 _TURNED = 4  # such cells of an image with something that turns
 _START = 100  # matches from which COLMAP starts a model
 _LOOKED_AT, _COMMON, _ROUNDS = 12, 30, 5  # images, points that two of them share, and fits of a rotation
-# of the longer side: what rotations leave of shifts; .0026 after a turn on the spot, .02 and more in six sets of photos
+# of the longer side: what rotations leave of shifts; .0026 after a turn on the spot, .02 and more in five photo sets
 _PARALLAX = 0.005
 
 
