@@ -156,6 +156,7 @@ def test_a_turn_on_the_spot_is_said() -> None:
         ),
         (still(3, 0, 430, 60), "that match best have 430 features in common, enough, but the camera only turned"),
         (still(2, 0, 0, 0), "the two images have no features in common"),
+        (still(2, 0, 430, 60), "the two images have 430 features in common, but two images do not determine"),
     ],
 )
 def test_what_two_photographs_lack_is_said(matches: Matches, said: str) -> None:

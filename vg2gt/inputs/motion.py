@@ -115,6 +115,8 @@ def why_not_placed(matches: Matches) -> str:
     which = "the two images" if len(matches.features) == 2 else "the two images that match best"
     if count < _START:
         return f"{which} have {count or 'no'} features in common, about {_START} are needed, so they overlap too little"
+    if len(matches.features) == 2:
+        return f"{which} have {count} features in common, but two images do not determine their focal length and motion"
     return f"{which} have {count} features in common, enough, but the camera only turned, or moved too little"
 
 
