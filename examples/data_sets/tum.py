@@ -58,6 +58,7 @@ class TUM(FileSource):
         shared: see ``FileSource``; the camera records 30 frames per second.
     """
 
+    recorded = True
     layout = "rgb.txt, depth.txt and groundtruth.txt, there or up to two folders deeper"
     scene_marks = ("rgb.txt",)
     index_options = ("intrinsics", "max_difference")

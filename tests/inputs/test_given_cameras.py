@@ -120,7 +120,7 @@ def test_depth_is_read_where_a_recording_has_it(recording: Path, tmp_path: Path,
     shutil.copytree(recording, tmp_path / "room")
     put_cameras(tmp_path / "room", frames)  # goes before the recording for whoever needs no depth
     with_depth = given_pictures(tmp_path / "room", depth=True)
-    check_cameras(with_depth, frames, "RGBDFolder")
+    check_cameras(with_depth, frames, "RGB-D")
     hints = load_views(with_depth, (56, 84), Monitor()).hints
     assert hints.depth.shape == (1, 4, 56, 84)
     assert hints.cameras.intrinsics[0, 0, 0, 0].item() == pytest.approx(0.75 * frames.intrinsics[0, 0, 0])

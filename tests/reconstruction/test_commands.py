@@ -32,7 +32,7 @@ def test_photographs_of_all_sizes(photos: Path, tmp_path: Path, capsys: pytest.C
     assert len(read_gaussian_ply(tmp_path / "out" / "scene.ply")) == figures["gaussians"]
     assert len({camera.width for camera in read_cameras_json(tmp_path / "out" / "cameras.json")}) == 1
     printed = capsys.readouterr().out
-    assert "4 images of 56x70" in printed
+    assert "from 4 images, which the model saw at 56x70" in printed
     assert "untrained" in printed
     assert "peak memory" in printed
     assert figures["refinement"]["steps"] == 30

@@ -61,7 +61,7 @@ def test_the_upright_frame_goes_into_the_given_one(folder: Path, frames, model, 
 def test_metric_cameras_give_metres(recording: Path, ready, monkeypatch) -> None:
     scene = reconstruct_with(ready.model, recording)
     assert scene.metres_per_unit == pytest.approx(1)
-    monkeypatch.setattr("vg2gt.inputs.camera_source.SFM_SOURCE", "RGBDFolder")
+    monkeypatch.setattr("vg2gt.inputs.camera_source.SFM_SOURCE", "RGB-D recording")
     upright = reconstruct_with(ready.model, recording)
     assert upright.metres_per_unit == pytest.approx(upright.frame.scale)
     assert upright.metres_per_unit != pytest.approx(1, abs=0.01)

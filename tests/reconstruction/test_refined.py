@@ -63,8 +63,8 @@ def test_the_command(saved: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytes
 
 
 def test_kinds_of_cameras_are_told_apart_in_one_place(scene: Scene) -> None:
-    described = {"": "PREDICTED", "structure from motion, 4 of 4 images": "FOUND", "RGBDFolder a": "RECORDED"}
-    described |= {"TUM a": "RECORDED", "COLMAP a": "GIVEN", "poses a": "GIVEN", "cameras.json": "GIVEN"}
+    described = {"": "PREDICTED", "structure from motion, 4 of 4 images": "FOUND", "RGB-D recording a": "RECORDED"}
+    described |= {"COLMAP a": "GIVEN", "poses a": "GIVEN", "cameras.json": "GIVEN"}
     assert {text: replace(scene, cameras_from=text).camera_source.name for text in described} == described
 
 
@@ -93,7 +93,7 @@ def test_photographs_are_refined_unless_asked_not_to(scene: Scene) -> None:
     assert refinement_for(replace(photographs, pictures=())).full is None  # no photographs to go on with
     predicted = refinement_for(replace(scene, cameras_from=""), steps=7)
     assert (predicted.steps, predicted.rates.cameras) == (7, RefineRates().cameras)
-    recording = replace(scene, cameras_from="RGBDFolder somewhere")
+    recording = replace(scene, cameras_from="RGB-D recording somewhere")
     assert not refined_by_default(recording)
     assert refinement_for(recording, steps=7) == RefineOptions(steps=7)
     with pytest.raises(ValueError, match="choose one of draft, normal, high"):

@@ -136,7 +136,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> Scene:
     cost = cost_figures(monitor)
     times = ", ".join(f"{name} {seconds:.1f}" for name, seconds in cost["seconds"].items() if seconds >= 0.05)
     height, width = scene.cameras.size
-    print(f"{len(scene.names)} images of {height}x{width}: {len(scene.gaussians)} Gaussians")
+    print(f"{len(scene.gaussians)} Gaussians from {len(scene.names)} images, which the model saw at {height}x{width}")
     if scene.refined is not None:
         print(*refinement_lines(scene), sep="\n")
     print(*trust_lines(scene), *place_lines(scene), sep="\n")

@@ -6,7 +6,7 @@ from enum import Enum
 
 from vg2gt.inputs.pictures import SFM_SOURCE
 
-RECORDERS = ("RGBDFolder", "TUM")  # data sets whose poses were measured together with depth
+RECORDING = "RGB-D recording"  # begins the description of cameras that were measured together with depth
 
 
 class CameraSource(Enum):
@@ -28,4 +28,4 @@ class CameraSource(Enum):
             return cls.PREDICTED
         if described.startswith(SFM_SOURCE):
             return cls.FOUND
-        return cls.RECORDED if described.startswith(RECORDERS) else cls.GIVEN
+        return cls.RECORDED if described.startswith(RECORDING) else cls.GIVEN

@@ -8,6 +8,7 @@ from vg2gt.data.sources.files import FileSource
 from vg2gt.data.sources.nerfstudio import Nerfstudio
 from vg2gt.data.sources.phone import app_of
 from vg2gt.data.sources.rgbd import RGBDFolder
+from vg2gt.inputs.camera_source import RECORDING
 from vg2gt.inputs.folders import is_photo
 from vg2gt.inputs.pictures import Picture
 
@@ -28,8 +29,10 @@ def recording_pictures(source: FileSource, with_tests: bool = False) -> list[Pic
     source.leave_out_damaged = True
     index = source.scene_index(scene)
     metric = source.is_metric or (isinstance(source, RGBDFolder) and (index.folder / "depth").is_dir())
-    recorded = metric or not isinstance(source, RGBDFolder) or app_of(index.folder) is not None
-    kind = f"{type(source).__name__ if recorded else 'poses'} {index.folder}"
+    name = RECORDING if source.recorded else type(source).__name__
+    if isinstance(source, RGBDFolder) and not metric and app_of(index.folder) is None:
+        name = "poses"
+    kind = f"{name} {index.folder}"
 
     def picture(frame: int) -> Picture:
         """Returns a frame as a picture that is read on demand."""

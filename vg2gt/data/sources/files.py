@@ -83,6 +83,8 @@ class FileSource(SceneSource):
     """Whether depth is known at single pixels only; see :class:`~vg2gt.data.base.Frames`."""
     reads_masks: ClassVar[bool] = False
     """Whether alpha and mask files weight the pixels; if not, alpha is only composited over white."""
+    recorded: ClassVar[bool] = False
+    """Whether a device measured the poses together with depth, so that they fit it better than other cameras."""
     leave_out_damaged: bool = False
     """Whether images that cannot be opened are left out, with a warning; otherwise they are errors."""
     depth_scale: float = 1000.0

@@ -77,6 +77,7 @@ class RGBDFolder(FileSource):
         "up to two folders deeper"
     )
     scene_files = (R3D,)
+    recorded = True
     names_are_paths = True
     index_options = ("intrinsics", "has_depth")
 
