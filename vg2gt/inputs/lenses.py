@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 # Ratio of a focal length to the median one: 1.08 at most in photographs of one lens, 1.2 and more if zoomed by 1.5.
 _DIFFERS = 1.15
-_FEWEST, _POINTS = 100, 4000  # points that an image sees, so that they tell its focal length, and points that are used
+_FEWEST, _POINTS = 30, 4000  # points that an image sees, so that they tell its focal length, and points that are used
 _ITERATIONS = 50
 
 Lenses = dict[tuple[int, int, float], list[str]]
