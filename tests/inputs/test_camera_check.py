@@ -1,5 +1,6 @@
 """Given cameras that contradict their images, on real photographs with known cameras."""
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -97,6 +98,17 @@ def test_what_is_wrong_is_said(right: list[Picture], change, said: str, caplog) 
     assert "they are used as they are" in caplog.text
 
 
+def test_a_camera_out_of_line_is_looked_at(right: list[Picture]) -> None:
+    """Among many images, of which only some are checked."""
+    line = [np.eye(4) + np.outer(np.eye(4)[0], [0, 0, 0, step]) for step in range(40)]
+    assert camera_check._out_of_line([replace(right[0], pose=pose) for pose in line]) == []
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_euler("y", 60, degrees=True).as_matrix()
+    for wrong in (turn @ line[17], line[30]):
+        poses = [*line[:17], wrong, *line[18:]]
+        assert camera_check._out_of_line([replace(right[0], pose=pose) for pose in poses]) == [17]
+
+
 def test_single_wrong_cameras_are_named(right: list[Picture], caplog) -> None:
     wrong = turned(right, lambda number, pose: np.linalg.inv(pose) if number == 6 else pose)
     check_cameras(wrong, Monitor())
@@ -119,13 +131,20 @@ def test_cameras_in_one_place_see_in_the_same_direction(turn: int) -> None:
     assert (camera_check._distance(pixels, views) < 0.02).mean() == (turn == 1)
 
 
-@pytest.mark.parametrize("factor", [0.8, 1.25])
-def test_a_wrong_focal_length_is_said(right: list[Picture], factor: float, monkeypatch, caplog) -> None:
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ([[0.8, 1, 1], [1, 0.8, 1], [1, 1, 1]], r"a focal length of about 1\.2"),
+        ([[1.25, 1, 1], [1, 1.25, 1], [1, 1, 1]], r"a focal length of about 0\.[78]"),
+        ([[1, 1, 1], [1, 0.8, 1], [1, 1, 1]], r"a vertical focal length of about 1\.2"),
+        ([[1, 1, 1.3], [1, 1, 1], [1, 1, 1]], r"a principal point moved by about -1\d% of the width"),
+        ([[1, 1, 1], [1, 1, 0.6], [1, 1, 1]], r"a principal point moved by about \+\d\d% of the height"),
+    ],
+)
+def test_a_wrong_lens_is_said(right: list[Picture], change, said: str, monkeypatch, caplog) -> None:
     matches, views = camera_check.match_pictures(right)
-    assert camera_check.better_focal(matches, views) is None
-    scale = np.array([[factor, 1, 1], [1, factor, 1], [1, 1, 1]])
-    wrong = {name: replace(view, intrinsics=view.intrinsics * scale) for name, view in views.items()}
-    assert camera_check.better_focal(matches, wrong) == pytest.approx(1 / factor, rel=0.06)
+    assert not camera_check.better_lens(matches, views)
+    wrong = {name: replace(view, intrinsics=view.intrinsics * np.array(change)) for name, view in views.items()}
     monkeypatch.setattr(camera_check, "match_pictures", lambda _: (matches, wrong))
     check_cameras(right, Monitor(), insisted=True)  # whether or not it is wrong enough to be an error
-    assert "better with a focal length of about" in caplog.text
+    assert re.search(f"better with {said}", caplog.text)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from tests.reconstruction.conftest import STAND_IN
 from vg2gt.cli import reconstruct as reconstruct_command
@@ -15,6 +16,7 @@ from vg2gt.geometry.alignment import align_points
 from vg2gt.geometry.cameras import camera_centers, project
 from vg2gt.inputs import sfm
 from vg2gt.inputs.inputs import load_views
+from vg2gt.inputs.lenses import own_lenses
 from vg2gt.inputs.pictures import Picture, find_pictures
 from vg2gt.io import colmap_images, read_colmap
 from vg2gt.io.image_files import focal_length
@@ -204,3 +206,32 @@ def test_masks_go_through(office: Path, tmp_path: Path) -> None:
     path = next((photos / "masks").iterdir())
     Image.fromarray(255 - np.array(Image.open(path))).save(path)
     assert sfm._key(find_pictures(photos)) != before
+
+
+@pytest.mark.parametrize("zoom", [1.0, 1.5])
+def test_images_of_several_focal_lengths_get_their_own_lenses(zoom: float) -> None:
+    """Two of ten images are enlarged, though the model has one lens for all."""
+    pycolmap = pytest.importorskip("pycolmap")
+    points = np.random.default_rng(0).uniform(-1, 1, (300, 3))
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(camera_id=1, model="SIMPLE_RADIAL", width=640, height=480, params=[500, 320, 240, 0])
+    )
+    tracks = [pycolmap.Track() for _ in points]
+    for number in range(10):
+        turn = Rotation.from_euler("y", 12 * number, degrees=True).as_matrix()
+        seen = points @ turn.T + (0, 0, 4)
+        pixels = 500 * (zoom if number in (3, 7) else 1) * seen[:, :2] / seen[:, 2:] + (320, 240)
+        pose = pycolmap.Rigid3d(np.column_stack([turn, (0, 0, 4)]))
+        model.add_image_with_trivial_frame(pycolmap.Image(f"{number}.jpg", pixels, 1, number + 1), pose)
+        for row, track in enumerate(tracks):
+            track.add_element(number + 1, row)
+    for place, track in zip(points, tracks, strict=True):
+        model.add_point3D(place, track, np.zeros(3, np.uint8))
+    names = [f"{number}.jpg" for number in range(12)]  # two have not been placed
+    found = own_lenses(model, {(480, 640, 0.0): names})
+    assert bool(found) == (zoom > 1)
+    if found:
+        focals = {name: focal for (_, _, focal), members in found.items() for name in members}
+        assert focals["3.jpg"] / focals["2.jpg"] == pytest.approx(zoom, rel=0.05)
+        assert found[480, 640, 0.0] == ["10.jpg", "11.jpg"]

@@ -48,9 +48,12 @@ def test_photographs_are_turned_upright(tmp_path: Path, orientation: int) -> Non
     upright = np.random.default_rng(0).integers(0, 256, (20, 30, 3), np.uint8)
     exif = Image.Exif()
     exif[0x0112] = orientation
-    Image.fromarray(np.ascontiguousarray(STORED[orientation](upright))).save(tmp_path / "a.png", exif=exif)
-    assert image_size(tmp_path / "a.png", "room", upright=True) == (20, 30)
-    assert np.array_equal(read_color(tmp_path / "a.png", "room", (20, 30), upright=True), upright)
+    stored = np.ascontiguousarray(STORED[orientation](upright))
+    for name in ("a.png", "a.tif"):
+        Image.fromarray(stored).save(tmp_path / name, exif=exif)
+        assert image_size(tmp_path / name, "room", upright=True) == (20, 30), name
+        assert np.array_equal(read_color(tmp_path / name, "room", (20, 30), upright=True), upright), name
+        assert np.array_equal(read_color(tmp_path / name, "room", stored.shape[:2]), stored), name
 
 
 def test_grey_photographs_are_no_masks_and_masks_may_hold_zero_and_one(tmp_path: Path) -> None:

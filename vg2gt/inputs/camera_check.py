@@ -36,9 +36,11 @@ _CONTRADICTED = 0.5  # share of the pairs that contradict the cameras, from whic
 _LOOKED_AT, _SMALL = 20, 320  # neighbours whose points are looked at, and the longer side of their images in pixels
 _COMMON = 30  # points of an image that others of these see, too
 _ALIKE = 0.5  # median correlation of their brightness, .92 and more in right models, below which images are others
+_ODD, _JUMP = 2, 3.0  # most images out of line that are looked at too, and how far out of line, in steps past them
 _FOCAL = np.geomspace(1 / 1.6, 1.6, 21)  # times the given focal length that are tried
-_NEAR = 0.0015  # of the longer side: median distance of matches up to which the given focal length fits
-_BETTER = 0.5  # share of that distance, below which another focal length is better
+_CENTER = np.linspace(-0.2, 0.2, 21)  # shifts of the principal point that are tried, of width or height
+_NEAR = 0.0015  # of the longer side: median distance of matches up to which the given lens fits
+_BETTER = 0.5  # share of that distance, below which another lens is better
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -61,7 +63,7 @@ _READINGS: dict[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
 
 
 def check_cameras(pictures: Sequence[Picture], monitor: Monitor, insisted: bool = False) -> None:
-    """Checks given cameras by matched features of up to ten images, if pycolmap is installed.
+    """Checks given cameras by matched features of 10 to 16 images, if pycolmap is installed.
 
     A match fits if the cameras see one point in front of both within 2 % of the longer side. The points of a sparse
     model are such matches; its images are checked to be those that it was made of.
@@ -78,14 +80,14 @@ def check_cameras(pictures: Sequence[Picture], monitor: Monitor, insisted: bool 
     known = [each for each in pictures if each.pose is not None and each.points is None]
     if len(known) < len(pictures) or len(known) < 2 or importlib.util.find_spec("pycolmap") is None:
         return
-    chosen = _neighbours(known, _GROUPS)
+    chosen = _neighbours(known, _GROUPS, _out_of_line(known))
     with monitor.stage("check cameras"):
         matches, views = match_pictures(chosen)
     shares = fitting_shares(matches, views)
-    if (factor := better_focal(matches, views)) is not None:
+    if better := better_lens(matches, views):
         log.warning(
-            "the images fit the cameras of %s better with a focal length of about %.2f times the given one: check it, "
-            "or find the cameras from the images by --poses sfm", pictures[0].source, factor,
+            "the images fit the cameras of %s better with %s: check it, or find the cameras from the images by "
+            "--poses sfm", pictures[0].source, better,
         )  # fmt: skip
     titles = {name: each.name for name, each in _numbered(chosen)}
     against = [f"{titles[one]} and {titles[other]}" for (one, other), share in shares.items() if share < _FITTING]
@@ -107,10 +109,26 @@ def _refuse(said: str, insisted: bool) -> None:
     log.warning("%s; they are used as they are", said)
 
 
-def _neighbours(pictures: Sequence[Picture], count: int) -> list[Picture]:
-    """Returns up to ``count`` pairs of neighbours, evenly spread."""
+def _neighbours(pictures: Sequence[Picture], count: int, odd: Sequence[int] = ()) -> list[Picture]:
+    """Returns up to ``count`` pairs of neighbours, evenly spread, and the images ``odd`` with theirs."""
     starts = spread(len(pictures) - 1, min(count, len(pictures) - 1))
-    return [pictures[place] for place in sorted({place + step for place in starts for step in range(2)})]
+    places = {place + step for place in starts for step in range(2)}
+    places |= {place + step for place in odd for step in (-1, 0, 1)}
+    return [pictures[place] for place in sorted(places)]
+
+
+def _out_of_line(pictures: Sequence[Picture]) -> list[int]:
+    """Returns the images that are farthest from their neighbours, in place or direction, if these are near each other.
+
+    A wrong camera among right ones is so; whether it is wrong, its matches tell.
+    """
+    poses = np.stack([each.pose for each in pictures if each.pose is not None])
+    found = np.zeros(len(poses))
+    for values in (-np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3]), poses[:, :3, :3].reshape(-1, 9)):
+        step, past = (np.linalg.norm(values[n:] - values[:-n], axis=1) for n in (1, 2))
+        floor = max(float(np.median(step)), np.finfo(float).tiny)
+        found[1:-1] = np.maximum(found[1:-1], np.minimum(step[1:], step[:-1]) / np.maximum(past, floor))
+    return [place for place in np.argsort(-found)[:_ODD].tolist() if found[place] > _JUMP]
 
 
 def _check_points(pictures: Sequence[Picture], insisted: bool) -> None:
@@ -189,19 +207,28 @@ def fitting_shares(matches: Matches, views: dict[str, CheckedView]) -> dict[tupl
     return {pair: float((off < _WITHIN).mean()) for pair, off in _distances(matches, views).items()}
 
 
-def better_focal(matches: Matches, views: dict[str, CheckedView]) -> float | None:
-    """Returns the factor of all focal lengths with which matches fit much better; None if those given fit."""
+def better_lens(matches: Matches, views: dict[str, CheckedView]) -> str:
+    """Says which other focal length or principal point makes matches fit much better; empty if the given ones fit."""
 
-    def distance(factor: float) -> float:
-        scale = np.array([[factor, 1, 1], [1, factor, 1], [1, 1, 1]])
-        scaled = {name: replace(view, intrinsics=view.intrinsics * scale) for name, view in views.items()}
-        found = list(_distances(matches, scaled).values())
+    def distance(scale: Sequence[float] = (1, 1), shift: Sequence[float] = (0, 0)) -> float:
+        change = np.diag([*scale, 1.0])
+        moved = {}
+        for name, view in views.items():
+            matrix = change @ view.intrinsics
+            matrix[:2, 2] = view.intrinsics[:2, 2] + np.array(shift) * view.size[::-1]
+            moved[name] = replace(view, intrinsics=matrix)
+        found = list(_distances(matches, moved).values())
         return float(np.median(np.minimum(np.concatenate(found), _WITHIN))) if found else 0.0
 
-    if (given := distance(1.0)) <= _NEAR:
-        return None
-    least, best = min((distance(factor), float(factor)) for factor in _FOCAL)
-    return best if least < _BETTER * given else None
+    if (given := distance()) <= _NEAR:
+        return ""
+    tried = [(distance((f, f)), f"a focal length of about {f:.2f} times the given one") for f in _FOCAL]
+    tried += [(distance((1, f)), f"a vertical focal length of about {f:.2f} times the given one") for f in _FOCAL]
+    for kind, axis in (("width", (1, 0)), ("height", (0, 1))):
+        said = f"a principal point moved by about {{:+.0%}} of the {kind}"
+        tried += [(distance(shift=share * np.array(axis)), said.format(share)) for share in _CENTER]
+    least, best = min(tried)
+    return best if least < _BETTER * given else ""
 
 
 def _distances(matches: Matches, views: dict[str, CheckedView]) -> dict[tuple[str, str], NDArray[np.float64]]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import closing
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,3 +58,12 @@ def _vlad(descriptors: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
 def _unit(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
     length = np.sqrt((vectors**2).sum(-1, keepdims=True, dtype=np.float32))
     return vectors / np.maximum(length, np.float32(1e-9))
+
+
+def descriptors_of(database: Path, names: Sequence[str]) -> list[NDArray[np.uint8]]:
+    """Returns the descriptors ``[n, 128]`` of images in a COLMAP database."""
+    import pycolmap  # pyright: ignore[reportMissingImports]
+
+    with closing(pycolmap.Database.open(database)) as opened:
+        numbers = {image.name: image.image_id for image in opened.read_all_images()}
+        return [np.asarray(opened.read_descriptors(numbers[name]).data) for name in names]

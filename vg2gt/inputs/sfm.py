@@ -18,7 +18,6 @@ import logging
 import shutil
 import tempfile
 from collections.abc import Sequence
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -30,12 +29,12 @@ from PIL import Image
 
 from vg2gt.data.sources.colmap_model import COLMAP, model_folder_of
 from vg2gt.data.sources.masks import mask_beside
-from vg2gt.data.sources.undistortion import lens_text
 from vg2gt.data.transforms import reduce_to_fit, to_bytes
 from vg2gt.inputs.distinct import digest
 from vg2gt.inputs.folds import unfold
 from vg2gt.inputs.given_cameras import LAYOUTS, SFM_STATE
-from vg2gt.inputs.likely_pairs import likely_pairs
+from vg2gt.inputs.lenses import lens_texts, own_lenses
+from vg2gt.inputs.likely_pairs import descriptors_of, likely_pairs
 from vg2gt.inputs.motion import check_motion, check_parallax, why_not_placed
 from vg2gt.inputs.pair_evidence import Matches
 from vg2gt.inputs.pictures import SFM_SOURCE, UNKNOWN_LENS, Picture
@@ -168,11 +167,10 @@ def _solve(pictures: Sequence[Picture], folder: Path, key: str, monitor: Monitor
             lenses = _stage(pictures, work, advance)
         names = sorted(name for members in lenses.values() for name in members)
         sides = [max(height, width) for (height, width, _), members in lenses.items() for _ in members]
-        find_features(work, lenses, names, feature_settings(sides), monitor)
-        match_features(work, names, monitor)
-        matches = Matches.read(work / "database.db")
-        check_motion(matches)
-        models = _map(work, len(names), monitor)
+        matches, models = _models(work, lenses, names, feature_settings(sides), monitor)
+        if models and (own := own_lenses(models[0], lenses)):
+            log.warning("the focal length changes from image to image (zoom, or crops): each gets a lens of its own")
+            matches, models = _models(work, own, names, feature_settings(sides), monitor)
         if not models:
             raise ValueError(
                 f"cannot find the cameras of these {len(pictures)} images: {why_not_placed(matches)}; {ADVICE}"
@@ -188,7 +186,7 @@ def _solve(pictures: Sequence[Picture], folder: Path, key: str, monitor: Monitor
             "images": {name: title for name, title in titles.items() if name in placed},
             "left_out": [title for name, title in titles.items() if name not in placed],
             "other_parts": [[titles[name] for name in sorted(part)] for part in others if part],
-            "lenses": _lenses(models[0], dict(zip(names, pictures, strict=True))),
+            "lenses": lens_texts(models[0], dict(zip(names, pictures, strict=True))),
             "error": round(models[0].compute_mean_reprojection_error(), 2),
             "undecided": [titles[name] for name in undecided],
             "folded": 0 if models is folded else len(folded[0].images),
@@ -200,6 +198,23 @@ def _solve(pictures: Sequence[Picture], folder: Path, key: str, monitor: Monitor
                 shutil.move(work / "undistorted-masks" / "images", staged / "masks")
             write_json(staged / SFM_STATE, state)
     return state
+
+
+def _models(
+    work: Path,
+    lenses: dict[tuple[int, int, float], list[str]],
+    names: Sequence[str],
+    settings: tuple[int, int, int],
+    monitor: Monitor,
+) -> tuple[Matches, list[Reconstruction]]:
+    """Returns the matches and the models of images with these lenses; arguments as in :func:`find_features`."""
+    (work / "database.db").unlink(missing_ok=True)
+    shutil.rmtree(work / "models", ignore_errors=True)
+    find_features(work, lenses, names, settings, monitor)
+    match_features(work, names, monitor)
+    matches = Matches.read(work / "database.db")
+    check_motion(matches)
+    return matches, _map(work, len(names), monitor)
 
 
 def _stage(pictures: Sequence[Picture], work: Path, advance: Any) -> dict[tuple[int, int, float], list[str]]:
@@ -303,7 +318,7 @@ def match_features(work: Path, names: Sequence[str], monitor: Monitor) -> None:
     database = work / "database.db"
     chosen = [(before, later) for later in range(len(names)) for before in range(later)]
     if len(names) > ALL_PAIRS:
-        chosen = likely_pairs(_descriptors(database, names))
+        chosen = likely_pairs(descriptors_of(database, names))
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu = False
     matching.num_threads = _threads()
@@ -351,12 +366,6 @@ def _map(work: Path, count: int, monitor: Monitor) -> list[Reconstruction]:
     return sorted(sound, key=lambda model: (model.num_reg_images(), model.num_points3D()), reverse=True)
 
 
-def _lenses(model: Reconstruction, pictures: dict[str, Picture]) -> dict[str, str]:
-    """Returns the lenses of the photographs as taken, by their names."""
-    placed = (image for image in model.images.values() if image.has_pose)
-    return {pictures[each.name].name: lens_text(each.camera, pictures[each.name].size) for each in placed}
-
-
 def _parts(models: Sequence[Reconstruction]) -> list[set[str]]:
     """Returns the names of the images that have a camera in each model and in none before it."""
     parts: list[set[str]] = []
@@ -364,14 +373,6 @@ def _parts(models: Sequence[Reconstruction]) -> list[set[str]]:
         placed = {image.name for image in model.images.values() if image.has_pose}
         parts.append(placed.difference(*parts))
     return parts
-
-
-def _descriptors(database: Path, names: Sequence[str]) -> list[NDArray[np.uint8]]:
-    import pycolmap  # pyright: ignore[reportMissingImports]
-
-    with closing(pycolmap.Database.open(database)) as opened:
-        numbers = {image.name: image.image_id for image in opened.read_all_images()}
-        return [np.asarray(opened.read_descriptors(numbers[name]).data) for name in names]
 
 
 def _write(model: Reconstruction, work: Path) -> None:

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
+from PIL.TiffImagePlugin import TiffImageFile
 
 from vg2gt.io.errors import DataError
 from vg2gt.io.images import color_image, has_alpha, open_image
@@ -32,6 +33,7 @@ _ORIENTATION_TAG = 0x0112
 _UPRIGHT = ("FLIP_LEFT_RIGHT", "ROTATE_180", "FLIP_TOP_BOTTOM", "TRANSPOSE", "ROTATE_270", "TRANSVERSE", "ROTATE_90")
 _TURNS = {number: Image.Transpose[name] for number, name in enumerate(_UPRIGHT, 2)}  # by EXIF orientation
 _QUARTER_TURNS = (5, 6, 7, 8)
+_BACK = {6: 8, 8: 6}  # orientations that undo others; the rest undo themselves
 _LARGE = 24_000_000  # pixels; larger images are decoded at reduced size where that suffices
 _DRAFT = 8  # largest reduction by the decoder
 _SAME_SHAPE = 0.02  # relative difference of aspect ratios of the same shape
@@ -149,7 +151,7 @@ def read_color(
     with _opened(path, scene, content) as image:
         found = _size(image, upright)
         check_size(path, scene, found, size)  # before anything is decoded
-        turn = _orientation(image) if upright else 1
+        turn = _turn(image, upright)
         factor = 1 if least is None else _reduction(found, least)
         return np.array(_turned(color_image(image if factor == 1 else _reduced(image, factor)), turn))
 
@@ -199,6 +201,7 @@ def read_mask(
         The mask; None if all pixels count, as in a photograph without transparency.
     """
     with _opened(path, scene, content) as image:
+        turn = _turn(image, upright)
         grey, labels = not has_alpha(image), is_mask and _has_labels(image)
         if grey and not is_mask:
             return None
@@ -208,7 +211,7 @@ def read_mask(
             plane = image if image.mode in ("I", "I;16") else image.convert("L")
         else:
             plane = image.convert("RGBA").getchannel("A")
-        values = np.array(_turned(plane, _orientation(image) if upright else 1), np.float32)
+        values = np.array(_turned(plane, turn), np.float32)
     highest = values.max(initial=0)
     if labels:
         values, highest = 255 * (values > 0), 255.0
@@ -325,9 +328,20 @@ def _turned(picture: Image.Image, orientation: int) -> Image.Image:
     return picture.transpose(_TURNS[orientation]) if orientation in _TURNS else picture
 
 
+def _turn(image: Image.Image, upright: bool) -> int:
+    """Returns the orientation to undo once an image is decoded; Pillow turns TIFF files upright itself."""
+    orientation = _orientation(image)
+    if isinstance(image, TiffImageFile):
+        return 1 if upright else _BACK.get(orientation, orientation)
+    return orientation if upright else 1
+
+
 def _size(image: Image.Image, upright: bool) -> Size:
+    height, width = image.height, image.width
+    if isinstance(image, TiffImageFile):  # Pillow's size is the stored or, from version 11 on, the upright one
+        width, height = (int(image.tag_v2[tag]) for tag in (ExifTags.Base.ImageWidth, ExifTags.Base.ImageLength))
     turned = upright and _orientation(image) in _QUARTER_TURNS
-    return (image.width, image.height) if turned else (image.height, image.width)
+    return (width, height) if turned else (height, width)
 
 
 def _orientation(image: Image.Image) -> int:
