@@ -208,7 +208,7 @@ def test_masks_go_through(office: Path, tmp_path: Path) -> None:
     assert sfm._key(find_pictures(photos)) != before
 
 
-@pytest.mark.parametrize("zoom", [1.0, 1.5])
+@pytest.mark.parametrize("zoom", [1.0, 1.2, 1.5])
 def test_images_of_several_focal_lengths_get_their_own_lenses(zoom: float) -> None:
     """Two of ten images are enlarged, though the model has one lens for all."""
     pycolmap = pytest.importorskip("pycolmap")

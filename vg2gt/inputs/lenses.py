@@ -13,8 +13,10 @@ from vg2gt.inputs.pictures import Picture
 if TYPE_CHECKING:
     from pycolmap import Reconstruction  # pyright: ignore[reportMissingImports]
 
-# Ratio of a focal length to the median one: 1.08 at most in photographs of one lens, 1.2 and more if zoomed by 1.5.
-_DIFFERS = 1.15
+# Focal lengths that differ from the median one by this factor come of a zoom if the median errors of these images fall
+# to this share: 0.26 to 0.65 with zooms of 1.2 to 2. Photographs of a single lens have 0.89 and more, though their
+# focal lengths may differ by 1.15 as well.
+_DIFFERS, _EXPLAINED = 1.07, 0.75
 _FEWEST, _POINTS = 30, 4000  # points that an image sees, so that they tell its focal length, and points that are used
 _ITERATIONS = 50
 
@@ -29,15 +31,19 @@ def lens_texts(model: Reconstruction, pictures: Mapping[str, Picture]) -> dict[s
 
 
 def own_lenses(model: Reconstruction, lenses: Lenses) -> Lenses:
-    """Returns a lens for each image, with its focal length, if these differ more than those of ``lenses``; else empty.
+    """Returns a lens for each image, with its focal length, if this explains the images much better; else empty.
 
     A model of images of several focal lengths that share one has small errors: it places cameras nearer instead. With
-    a lens of its own for each, a bundle adjustment of its points moves the focal lengths apart.
+    a lens of its own for each, a bundle adjustment of its points moves the focal lengths apart and the errors fall.
     """
-    focals = _own_focals(model)
-    shared = {each.name: float(each.camera.params[0]) for each in model.images.values()}
-    ratios = np.log([focal / shared[name] for name, focal in focals.items()])
-    if not len(ratios) or np.abs(ratios - np.median(ratios)).max() <= np.log(_DIFFERS):
+    single = _with_own_lenses(model)
+    shared, before = _focals(single), _errors(single)
+    _adjust(single)
+    focals, after = _focals(single), _errors(single)
+    ratios = {name: np.log(focal / shared[name]) for name, focal in focals.items()}
+    middle = np.median(list(ratios.values())) if ratios else 0.0
+    others = [name for name, ratio in ratios.items() if abs(ratio - middle) > np.log(_DIFFERS)]
+    if not others or np.median([after[name] / max(before[name], 1e-9) for name in others]) > _EXPLAINED:
         return {}
     found: Lenses = {}
     for (height, width, _), names in lenses.items():
@@ -46,8 +52,8 @@ def own_lenses(model: Reconstruction, lenses: Lenses) -> Lenses:
     return found
 
 
-def _own_focals(model: Reconstruction) -> dict[str, float]:
-    """Returns the focal lengths, in pixels, of images with a lens of their own, by name."""
+def _with_own_lenses(model: Reconstruction) -> Reconstruction:
+    """Returns a model of the points that most images see, with a camera for each image."""
     import pycolmap  # pyright: ignore[reportMissingImports]
 
     single = pycolmap.Reconstruction()
@@ -60,14 +66,39 @@ def _own_focals(model: Reconstruction) -> dict[str, float]:
             single.add_image_with_trivial_frame(
                 pycolmap.Image(image.name, pixels, number, number), image.cam_from_world()
             )
-    points = sorted(model.points3D.values(), key=lambda point: -point.track.length())[:_POINTS]
-    for point in points:
+    for point in sorted(model.points3D.values(), key=lambda point: -point.track.length())[:_POINTS]:
         single.add_point3D(point.xyz, point.track, point.color)
+    return single
+
+
+def _adjust(model: Reconstruction) -> None:
+    """Adjusts poses, points and focal lengths; unlike ``pycolmap.bundle_adjustment``, without switching on the log."""
+    import pycolmap  # pyright: ignore[reportMissingImports]
+
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = options.refine_extra_params = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
     options.ceres.solver_options.max_num_iterations = _ITERATIONS
     options.ceres.solver_options.num_threads = 1  # fixed order of sums
-    pycolmap.bundle_adjustment(single, options)
-    seen = [image for image in single.images.values() if image.num_points3D >= _FEWEST]
+    config = pycolmap.BundleAdjustmentConfig()
+    for number in model.images:
+        config.add_image(number)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+
+
+def _focals(model: Reconstruction) -> dict[str, float]:
+    """Returns the focal lengths, in pixels, of images with enough points to tell them, by name."""
+    seen = (image for image in model.images.values() if image.num_points3D >= _FEWEST)
     return {image.name: float(image.camera.params[0]) for image in seen}
+
+
+def _errors(model: Reconstruction) -> dict[str, float]:
+    """Returns the median distances of points from where images see them, in pixels, by name."""
+    found = {}
+    for image in model.images.values():
+        seen = [point for point in image.points2D if point.has_point3D()]
+        pixels = (image.project_point(model.points3D[point.point3D_id].xyz) for point in seen)
+        off = [np.linalg.norm(at - point.xy) for at, point in zip(pixels, seen, strict=True) if at is not None]
+        found[image.name] = float(np.median(off)) if off else 0.0
+    return found
