@@ -60,6 +60,26 @@ def test_equals_the_published_weights_and_code(shared: Path) -> None:
     assert largest(found["hidden"], case["hidden"]) < 2e-4
 
 
+def test_decoding_has_the_gradient_of_the_mean_over_all_bins() -> None:
+    """The most likely bin is chosen without one: enhanced tokens could not move depth beyond the bins around it."""
+    update = IterMVSNet().double().iter_mvs.update
+    hidden = torch.randn(1, 32, 2, 3, generator=torch.Generator().manual_seed(0)).double()
+    chosen = update.position(hidden)
+    lifted = hidden.clone().requires_grad_()
+    found = update.position(lifted)
+    assert torch.allclose(found, chosen, rtol=0, atol=1e-12)
+    (gradient,) = torch.autograd.grad(found.sum(), lifted)
+    step = 1e-6 * torch.randn(hidden.shape, generator=torch.Generator().manual_seed(1)).double()
+
+    def means(values: Tensor) -> Tensor:
+        return (update.depth_head(values).softmax(1) * torch.arange(256.0).view(-1, 1, 1)).sum(1) / 255
+
+    with torch.no_grad():
+        local = update.position(hidden + step) - update.position(hidden - step)
+        expected = (local.sum() + (means(hidden + step) - means(hidden - step)).sum()) / 2
+    assert float((gradient * step).sum()) == pytest.approx(float(expected), rel=1e-4)
+
+
 @pytest.fixture
 def problem(make_scene) -> tuple:
     """Features, projections, hypotheses (some behind the sources or outside) and weights of three views."""

@@ -208,7 +208,11 @@ class Update(nn.Module):
         around = torch.arange(-_WINDOW, _WINDOW + 1, device=hidden.device)
         bins = (probability.argmax(-1, keepdim=True) + around).clamp(0, _BINS - 1)
         mass = probability.gather(-1, bins)
-        return ((bins * mass).sum(-1) / (mass.sum(-1) + 1e-6) / (_BINS - 1))[:, None]
+        found = (bins * mass).sum(-1) / (mass.sum(-1) + 1e-6)
+        if probability.requires_grad:  # the choice of the bin has no gradient; this is that of the mean over all bins
+            mean = (probability * torch.arange(_BINS, device=hidden.device)).sum(-1)
+            found = found + mean - mean.detach()
+        return (found / (_BINS - 1))[:, None]
 
 
 class Recurrence(nn.Module):
