@@ -164,7 +164,7 @@ def _name_others(scene: Scene, folder: Path, outputs: Sequence[str]) -> None:
         return
     written = {_target(output) for output in outputs}
     others = [name for name in map(_target, OUTPUTS) if name not in written and (folder / name).exists()]
-    poses = [np.stack([camera.world_to_camera for camera in each]) for each in (before, now)]
+    poses = [np.array([camera.world_to_camera for camera in each]) for each in (before, now)]
     same = [view_stem(camera.name) for camera in before] == [view_stem(camera.name) for camera in now]
     if others and not (same and np.abs(poses[0] - poses[1]).max() <= _SAME * max(np.abs(poses[1]).max(), 1)):
         log.warning("%s also holds files of another scene, which later commands mix: %s; remove them or choose another "
