@@ -28,6 +28,22 @@ def test_photographs_of_all_sizes_come_upright_in_the_order_of_their_numbers(pho
     assert views.hints.frame_ids.tolist() == [list(range(4))]
 
 
+def test_a_long_video_may_begin_in_the_middle(tmp_path: Path, monkeypatch) -> None:
+    """As one that was cut without coding it again: what comes before the next whole frame cannot be decoded."""
+    av = pytest.importorskip("av")
+    noise = np.random.default_rng(0).integers(0, 256, (32, 64, 3)).astype(np.uint8)
+    with av.open(str(tmp_path / "cut.mkv"), "w") as container:
+        stream = container.add_stream("libx264", 10, {"g": "6", "sc_threshold": "0", "bf": "0"})
+        stream.width, stream.height, stream.pix_fmt = 64, 32, "yuv420p"
+        images = [av.VideoFrame.from_ndarray(np.roll(noise, 2 * i, 1), "rgb24") for i in range(20)]
+        packets = [packet for image in (*images, None) for packet in stream.encode(image)]
+        container.mux(packets[2:])
+    monkeypatch.setattr(pictures, "IN_MEMORY", 2)
+    found = find_pictures(tmp_path / "cut.mkv", max_images=6)
+    assert len(found) > 3
+    assert found[0].read((32, 64)).images.shape == (1, 3, *found[0].size)
+
+
 def test_order_and_mixture_of_arguments_are_kept(photos: Path, frames) -> None:
     given = [frames.images[3], photos / "IMG_9.jpg", Image.open(photos / "IMG_10.jpg"), frames.images[:2]]
     views = _views(given)

@@ -125,6 +125,24 @@ def test_ten_bits_are_read_as_eight(tmp_path: Path) -> None:
         assert np.abs(frame - _frames()[number].astype(int)).mean() < 12
 
 
+def test_the_video_is_read_not_the_preview_before_it(tmp_path: Path) -> None:
+    av = pytest.importorskip("av")
+    with av.open(str(tmp_path / "two.mkv"), "w") as container:
+        streams = [container.add_stream("libx264", 10, {"bf": "0"}) for _ in range(2)]
+        for stream, size, disposition in zip(streams, (16, 32), (0, 1), strict=True):  # 1: to be shown
+            stream.width, stream.height, stream.pix_fmt = 2 * size, size, "yuv420p"
+            stream.disposition = disposition
+        for frame in _frames(5, (32, 64)):
+            for stream, step in zip(streams, (2, 1), strict=True):
+                shown = np.ascontiguousarray(frame[::step, ::step])
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(shown, "rgb24")))
+        for stream in streams:
+            container.mux(stream.encode(None))
+    assert count_frames(tmp_path / "two.mkv") == 5
+    assert [frame.shape for _, frame in read_video(tmp_path / "two.mkv")] == [(32, 64, 3)] * 5
+    assert read_frame(tmp_path / "two.mkv", 3).shape == (32, 64, 3)
+
+
 @pytest.mark.parametrize(
     "content",
     [

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -125,6 +126,18 @@ def test_nothing_is_replaced_unasked(written: Path, scene: Scene, tmp_path: Path
     (tmp_path / "color" / "stale.png").touch()
     write_outputs(scene, tmp_path, ["color.png"], overwrite=True)
     assert not (tmp_path / "color" / "stale.png").exists()
+
+
+def test_two_scenes_in_a_folder_are_said(scene: Scene, tmp_path: Path, caplog) -> None:
+    write_outputs(scene, tmp_path, ["scene.ply", "cameras.json", "report.json"])
+    write_outputs(scene, tmp_path, ["scene.spz", "report.json"], overwrite=True)
+    assert not caplog.messages
+    other = replace(scene, names=tuple(f"other-{name}" for name in scene.names), pictures=())
+    write_outputs(other, tmp_path, ["scene.spz", "report.json"], overwrite=True)
+    assert "holds files of another scene, which later commands mix: scene.ply, cameras.json;" in caplog.text
+    caplog.clear()
+    write_outputs(other, tmp_path, ["scene.ply", "scene.spz", "cameras.json", "report.json"], overwrite=True)
+    assert not caplog.messages
 
 
 def renamed(folder: Path, frames: Frames, names: list[str]) -> Path:

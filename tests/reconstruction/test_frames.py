@@ -72,7 +72,7 @@ def test_gps_gives_metres_and_up(folder: Path, frames, tmp_path: Path, monkeypat
     put_colmap(folder, frames)
     monkeypatch.setattr("vg2gt.inputs.camera_source.SFM_SOURCE", "COLMAP")
     centers = invert_pose(frames.world_to_camera.double().numpy())[:, :3, 3]
-    to_enu = 37 * Rotation.from_euler("x", 180, degrees=True).as_matrix()  # the room's z is down
+    to_enu = 37 * Rotation.from_euler("x", 70, degrees=True).as_matrix()  # the room's z is up
     for file, position in zip(sorted((folder / "images").iterdir()), on_earth(centers @ to_enu.T), strict=True):
         with_gps(file, position)
     run(folder, "--out", tmp_path / "out", "--save", "scene.ply,cameras.json,report.json,views.npz")
@@ -88,6 +88,19 @@ def test_gps_gives_metres_and_up(folder: Path, frames, tmp_path: Path, monkeypat
     found = invert_pose(scene.poses.numpy())[:, :3, 3] @ np.array(report["gps"]["to_enu"])[:3, :3].T
     known = centers @ to_enu.T
     np.testing.assert_allclose(found - found[0], known - known[0], atol=0.02 * np.ptp(known))
+
+
+def test_gps_by_which_the_photographs_are_upside_down_does_not_count(folder: Path, frames, model, caplog) -> None:
+    """As with latitude and longitude swapped, or east for west: such positions are mirrored."""
+    put_colmap(folder, frames)
+    centers = invert_pose(frames.world_to_camera.double().numpy())[:, :3, 3]
+    files = sorted((folder / "images").iterdir())
+    for is_mirrored in (False, True):
+        metres = 37 * centers * ([1, -1, -1] if is_mirrored else [1, 1, 1])  # a mirror turns over what is level
+        for file, position in zip(files, on_earth(metres), strict=True):
+            with_gps(file, position)
+        assert (reconstruct_with(model, folder).metres_per_unit is None) == is_mirrored
+        assert ("upside down; are latitude and longitude swapped" in caplog.text) == is_mirrored
 
 
 def test_gps_without_altitude_is_said(folder: Path, frames, model, caplog) -> None:
@@ -162,6 +175,8 @@ def test_two_points_or_control_points_place_a_scene(folder: Path, frames, tmp_pa
     for wrong in ("0,0,1=1m", "0,0,1,0,0,1=1m", "0,0,1,0,0,2=1", "0,0,1,0,0,2=-1m", "0,0,1,0,0,nan=1m"):
         with pytest.raises(SystemExit):
             place.main([str(out), f"--scale={wrong}"])
+    place.main([str(out), "--scale", "-.5,0,0,1,0,0=3m"])
+    assert "is 2 m" in capsys.readouterr().out
     points = np.array([[0, 0, 0], [4, 0, 0], [0, 0, 5], [4, 1, 5.0]])
     to_enu = 11 * Rotation.from_euler("x", -90, degrees=True).as_matrix()
     np.savetxt(tmp_path / "control.csv", np.hstack([points, on_earth(points @ to_enu.T)]), delimiter=",", fmt="%.12f")

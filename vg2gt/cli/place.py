@@ -19,6 +19,7 @@ _SCALE = re.compile(rf"(.+)=\s*([\d.eE+-]+)\s*({'|'.join(_UNITS)})")
 def main(argv: Sequence[str] | None = None) -> None:
     """Runs the command; errors are reported in one line."""
     parser = flag_parser("place")
+    parser._negative_number_matcher = re.compile(r"-[\d.]")  # points may begin with a minus
     add = parser.add_argument
     add("scene", type=Path, metavar="DIR", help="a folder that vg2gt reconstruct has written")
     how = parser.add_mutually_exclusive_group(required=True).add_argument

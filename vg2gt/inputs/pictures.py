@@ -47,7 +47,7 @@ from vg2gt.io.image_files import (
 from vg2gt.io.images import color_image, has_alpha
 from vg2gt.io.photogrammetry import is_camera_file
 from vg2gt.io.record3d import R3D, is_archive, read_recorded, recorded_files
-from vg2gt.io.video import VIDEO_SUFFIXES, VideoFrames, count_frames, require_pyav, sharpest_frames, video_size
+from vg2gt.io.video import VIDEO_SUFFIXES, VideoFrames, count_frames, require_pyav, sharpest_frames
 
 log = logging.getLogger(__name__)
 
@@ -334,14 +334,14 @@ def _video(path: Path, limit: int) -> list[Picture]:
         log.warning("%s: %d frames are taken of %d, the most of a video", path, MOST_FRAMES, count)
     chosen = sharpest_frames(path, count, min(count, limit, MOST_FRAMES))
     if min(count, limit) > IN_MEMORY:
-        numbers = [number for number, _ in chosen]
-        size, frames = video_size(path), VideoFrames(path, set(numbers))
+        names = {number: f"{path.stem}-{number:06d}" for number, _ in chosen}
+        frames = VideoFrames(path, names)
+        size = frames.read(min(names)).shape[:2]
 
         def picture(number: int) -> Picture:
-            name = f"{path.stem}-{number:06d}"
-            return Picture(name, size, lambda wanted: frame_of(shrunk(frames.read(number), wanted)))
+            return Picture(names[number], size, lambda wanted: frame_of(shrunk(frames.read(number), wanted)))
 
-        found = [picture(number) for number in numbers]
+        found = [picture(number) for number in names]
     else:
         found = [_in_memory(f"{path.stem}-{number:06d}", pixels()) for number, pixels in chosen]
     return [replace(each, container=path) for each in found]

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from fractions import Fraction
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,7 +55,7 @@ def count_frames(path: str | Path) -> int:
         ImportError: if PyAV is not installed.
     """
     with _opened(path) as container:
-        return sum(_shown(packet) for packet in container.demux(video=0))
+        return sum(_shown(packet) for packet in container.demux(_stream(container)))
 
 
 def read_video(path: str | Path, numbers: Container[int] | None = None) -> Iterator[tuple[int, NDArray[np.uint8]]]:
@@ -76,7 +76,7 @@ def read_video(path: str | Path, numbers: Container[int] | None = None) -> Itera
     with _opened(path) as container:
         for number, frame in enumerate(_decoded(container)):
             if numbers is None or number in numbers:
-                yield number, _upright(frame, container.streams.video[0])
+                yield number, _upright(frame, _stream(container))
         if number < 0:
             raise FormatError(f"{path}: {_UNDECODABLE}")
 
@@ -104,7 +104,7 @@ def sharpest_frames(path: str | Path, count: int, limit: int) -> Iterator[tuple[
         for _, frames in itertools.groupby(numbered, lambda pair: min(pair[0] * limit // count, limit - 1)):
             number, sharpest = max(frames, key=lambda pair: _sharpness(pair[1]))
             found = True
-            yield number, lambda frame=sharpest: _upright(frame, container.streams.video[0])
+            yield number, lambda frame=sharpest: _upright(frame, _stream(container))
         if not found:
             raise FormatError(f"{path}: {_UNDECODABLE}")
 
@@ -151,10 +151,10 @@ def read_frame(path: str | Path, number: int) -> NDArray[np.uint8]:
     if not 0 <= number < len(times):
         raise FormatError(f"{path} has {len(times)} frames, but frame {number} was requested")
     with _opened(path) as container:
-        container.seek(times[number], stream=container.streams.video[0])
+        container.seek(times[number], stream=_stream(container))
         for frame in _decoded(container):
             if frame.pts == times[number]:
-                return _upright(frame, container.streams.video[0])
+                return _upright(frame, _stream(container))
     raise FormatError(f"{path}: frame {number} cannot be decoded; the file is damaged")
 
 
@@ -169,6 +169,11 @@ def video_size(path: str | Path) -> tuple[int, int]:
     return height, width
 
 
+def _stream(container: InputContainer) -> VideoStream:
+    """Returns the video stream that players show: files may have a preview or a cover before it."""
+    return cast("VideoStream", container.streams.best("video"))
+
+
 def _shown(packet: Packet) -> bool:
     """Returns whether a packet holds a frame to show: not the empty last one, nor what a trimmed video skips."""
     return packet.size > 0 and not packet.is_discard
@@ -178,7 +183,9 @@ def _shown(packet: Packet) -> bool:
 def _frame_times(path: str | Path, state: int) -> list[int]:
     """Sorted presentation times of all frames; a new ``state`` invalidates the cache when the file changes."""
     with _opened(path) as container:
-        return sorted(packet.pts for packet in container.demux(video=0) if _shown(packet) and packet.pts is not None)
+        return sorted(
+            packet.pts for packet in container.demux(_stream(container)) if _shown(packet) and packet.pts is not None
+        )
 
 
 def write_video(path: str | Path, frames: Iterable[NDArray[np.uint8]], fps: float = 24.0) -> Path:
@@ -254,11 +261,11 @@ def _opened(path: str | Path) -> Iterator[InputContainer]:
 
 
 def _decoded(container: InputContainer) -> Iterator[VideoFrame]:
-    """Decodes the frames of the first video stream; damaged packets are skipped."""
+    """Decodes the frames of the video stream; damaged packets are skipped."""
     from av.error import InvalidDataError
 
-    container.streams.video[0].thread_type = "AUTO"
-    for packet in container.demux(video=0):
+    _stream(container).thread_type = "AUTO"
+    for packet in container.demux(_stream(container)):
         try:
             frames = packet.decode()
         except InvalidDataError:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -23,6 +24,7 @@ from vg2gt.io import (
     TransformsFrame,
     colmap_from_views,
     fuse_depth,
+    read_cameras_json,
     write_cameras_json,
     write_colmap,
     write_gaussian_gltf,
@@ -33,13 +35,14 @@ from vg2gt.io import (
     write_tiles,
     write_transforms,
 )
+from vg2gt.io.errors import FormatError, some
 from vg2gt.io.files import portable, whole_folder, write_bytes, write_json
 from vg2gt.io.images import colorize_depth, colorize_normals, grid, to_pixels, write_png
 from vg2gt.io.solid import fuse_solid
 from vg2gt.io.video import video_writer
 from vg2gt.monitor import Monitor
 from vg2gt.outputs.export import exported_views
-from vg2gt.outputs.output_names import DEFAULT, MAPS, PREDICTED, check_outputs
+from vg2gt.outputs.output_names import DEFAULT, MAPS, OUTPUTS, PREDICTED, check_outputs
 from vg2gt.reconstruction.frame import place_figures
 from vg2gt.reconstruction.refined import refinement_figures
 from vg2gt.reconstruction.trust import trust_figures, trust_picture
@@ -49,9 +52,12 @@ from vg2gt.visibility import Status, point_support
 if TYPE_CHECKING:
     from vg2gt.reconstruction.scene import RenderedView, Scene
 
+log = logging.getLogger(__name__)
+
 ROWS = 12  # maximum number of views in report.png
 MESH_PIXELS = 2.0  # edge of a mesh voxel, in pixels at the median depth
 _LEAST_BYTES, _PHOTO_BYTES = 500_000, 300_000  # written per image: Gaussians and maps, an exported photograph
+_SAME = 1e-3  # largest difference of the poses of a scene that was made again, relative to their extent
 _MESH_DEPTHS = 10.0  # maximum depth of the mesh, in median depths
 
 AddView: TypeAlias = "Callable[[RenderedView], None]"
@@ -131,6 +137,7 @@ def write_outputs(
     """
     check_outputs(outputs)
     folder = check_folder(folder, outputs, overwrite)
+    _name_others(scene, folder, outputs)
     monitor = monitor or Monitor()
     plain = [output for output in outputs if output in _WRITERS]
     if plain:
@@ -147,6 +154,21 @@ def write_outputs(
     if "report.json" in outputs:
         write_json(folder / "report.json", {**_scene_figures(scene), **(figures or {}), **cost_figures(monitor)})
     return folder
+
+
+def _name_others(scene: Scene, folder: Path, outputs: Sequence[str]) -> None:
+    """Warns about outputs of another scene that stay in the folder, among which later commands would take some."""
+    try:
+        before, now = read_cameras_json(folder / "cameras.json"), scene.named_cameras()
+    except (FormatError, OSError):
+        return
+    written = {_target(output) for output in outputs}
+    others = [name for name in map(_target, OUTPUTS) if name not in written and (folder / name).exists()]
+    poses = [np.array([camera.world_to_camera for camera in each]) for each in (before, now)]
+    same = [view_stem(camera.name) for camera in before] == [view_stem(camera.name) for camera in now]
+    if others and not (same and np.abs(poses[0] - poses[1]).max() <= _SAME * max(np.abs(poses[1]).max(), 1)):
+        log.warning("%s also holds files of another scene, which later commands mix: %s; remove them or choose another "
+            "folder", folder, some(others))  # fmt: skip
 
 
 def _scene_figures(scene: Scene) -> dict[str, Any]:

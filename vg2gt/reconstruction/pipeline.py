@@ -46,6 +46,10 @@ from vg2gt.uncertainty import Calibration
 
 log = logging.getLogger(__name__)
 
+# Mean of the upward parts of a camera's axes down and ahead: -1 if it is held level or looks straight down, 1 if that
+# is mirrored.
+_UPSIDE_DOWN = 0.5
+
 
 @dataclass(frozen=True)
 class Pipeline(LoadedModel):
@@ -231,4 +235,15 @@ def _place(cameras: Cameras, frame: SceneFrame, pictures: Sequence[Picture]) -> 
     place = fit_place(centers @ frame.to_source[:3, :3].T + frame.to_source[:3, 3], positions)
     if place is None:
         log.warning("the GPS positions of the photographs are too few or too coarse to give the scene a scale")
+        return None
+    axes = (
+        cameras.world_to_camera[0, :, :3, :3].detach().cpu().double().numpy()
+        @ (frame.to_source[:3, :3] / frame.scale).T
+    )
+    if place.is_level and float(((axes[:, 1] + axes[:, 2]) @ place.up).mean()) > _UPSIDE_DOWN:
+        log.warning(
+            "the GPS positions of the photographs do not count: by them, the photographs are upside down; are latitude "
+            "and longitude swapped, or is east written for west?"
+        )
+        return None
     return place
