@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import re
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +20,6 @@ _SCALE = re.compile(rf"(.+)=\s*([\d.eE+-]+)\s*({'|'.join(_UNITS)})")
 def main(argv: Sequence[str] | None = None) -> None:
     """Runs the command; errors are reported in one line."""
     parser = flag_parser("place")
-    parser._negative_number_matcher = re.compile(r"-[\d.]")  # points may begin with a minus
     add = parser.add_argument
     add("scene", type=Path, metavar="DIR", help="a folder that vg2gt reconstruct has written")
     how = parser.add_mutually_exclusive_group(required=True).add_argument
@@ -28,7 +28,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     how("--control", type=Path, metavar="FILE", help="control points: OpenDroneMap's gcp_list.txt, or a CSV with lines "
         "x,y,z,latitude,longitude,altitude for each point, in the scene's frame, degrees and metres")  # fmt: skip
     with errors_in_one_line():
-        run(parser.parse_args(argv))
+        words = list(sys.argv[1:] if argv is None else argv)
+        if "--scale" in words[:-1]:  # argparse takes a point that begins with a minus for an option
+            place = words.index("--scale")
+            words[place : place + 2] = [f"--scale={words[place + 1]}"]
+        run(parser.parse_args(words))
 
 
 def run(arguments: argparse.Namespace) -> None:
