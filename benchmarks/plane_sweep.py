@@ -2,7 +2,8 @@
 
 Only cameras are given; the network finds the depth range. Scenes are procedural ones on which nothing was trained, with
 ``--shared FOLDER`` also real recordings, and with ``--infinigen FOLDER`` rooms of Infinigen. ``--itermvs FOLDER`` runs
-IterMVS (``examples/backends``) on the same views, ``--cascade FILE`` the plane sweep in training (``recipes/cascade``).
+IterMVS (``examples/backends``) on the same views, ``--cascade FILE`` the plane sweep in training (``recipes/cascade``),
+and ``--ckpt RUN`` the backbone of a trained model, before and after its coarse module.
 Depth is compared after alignment by one median scale per set of views, except ``raw``. Prints a table and writes a
 dated JSON file.
 """
@@ -10,9 +11,11 @@ dated JSON file.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
+from typing import TypeAlias
 
 import torch
 from common import machine, parser, write_results
@@ -25,7 +28,11 @@ from examples.backends.itermvs import IterMVSBackend
 from vg2gt import __version__
 from vg2gt.config import compose
 from vg2gt.metrics.kinds import KINDS, pixel_kinds
-from vg2gt.types import Batch, Hints
+from vg2gt.model import VG2GT
+from vg2gt.runs.load import load_model
+from vg2gt.types import Batch, Geometry, Hints
+
+Depth: TypeAlias = Callable[[Batch], Geometry]
 
 MADE = " data.eval_scenes={scenes} data.image_size=[112,224]"
 WORLDS = f"hydra.searchpath=[{Path(__file__).parents[1] / 'examples/worlds/configs'}] data=worlds" + MADE
@@ -50,9 +57,28 @@ def batches(overrides: str) -> Iterator[Batch]:
         yield batch.context
 
 
+def of_backbone(backend: Backend) -> Depth:
+    """Returns what predicts the depth of a backbone."""
+    return lambda batch: backend.decode(backend.encode(batch.images, Hints(cameras=batch.cameras)))
+
+
+def enhanced(model: VG2GT) -> Depth:
+    """Returns what predicts the depth of a model after its coarse module, in the unit of its backbone."""
+
+    def predict(batch: Batch) -> Geometry:
+        found = model.enhance(batch.images, Hints(cameras=batch.cameras))[1]
+        return replace(found.geometry, depth=found.geometry.depth / found.unit[:, None, None, None])
+
+    return predict
+
+
 @torch.no_grad()
-def measure(backend: Backend, batch: Batch) -> dict[str, float]:
+def measure(depth_of: Depth, batch: Batch) -> dict[str, float]:
     """Computes depth errors of a batch of one scene over all pixels with known truth (not 0).
+
+    Args:
+        depth_of: predicts the geometry of a batch.
+        batch: input views with their true depth.
 
     Returns:
         ``raw``: mean relative error without alignment. With one median scale: ``abs_rel`` and ``median``, the mean and
@@ -61,7 +87,7 @@ def measure(backend: Backend, batch: Batch) -> dict[str, float]:
         ``error``, the part of abs_rel that these pixels make up. ``cpu_s_per_view``: processor time.
     """
     start = time.process_time()
-    geometry = backend.decode(backend.encode(batch.images, Hints(cameras=batch.cameras)))
+    geometry = depth_of(batch)
     spent = time.process_time() - start
     depth, truth = geometry.depth[0], batch.depth[0]
     valid = (truth > 0) & torch.isfinite(depth) & (depth > 0)
@@ -90,6 +116,7 @@ def main() -> None:
     arguments.add_argument("--scenes", type=int, default=16, help="number of procedural scenes of a kind")
     arguments.add_argument("--itermvs", type=Path, help="checkout of FangjinhuaWang/IterMVS: measures it as well")
     arguments.add_argument("--cascade", help="weights of the cascade: measures it as well")
+    arguments.add_argument("--ckpt", help="run: measures its backbone, and the depth after its coarse module, as well")
     options = arguments.parse_args()
     torch.set_num_threads(1)
     backend = SweepBackend(path=options.weights)
@@ -99,11 +126,18 @@ def main() -> None:
         backends[", IterMVS"] = IterMVSBackend(path=str(weights))
     if options.cascade:
         backends[", cascade"] = CascadeBackend(path=options.cascade)
+    predictors = {suffix: of_backbone(network) for suffix, network in backends.items()}
+    if options.ckpt:
+        model = load_model(options.ckpt, device="cpu").model
+        if not isinstance(model, VG2GT):
+            raise SystemExit(f"{options.ckpt} has no coarse module")
+        backends[", run"] = model.backend
+        predictors |= {", run": of_backbone(model.backend), ", run enhanced": enhanced(model)}
     sets: dict[str, dict[str, float]] = {}
-    for (name, overrides), (suffix, network) in product(SETS.items(), backends.items()):
+    for (name, overrides), (suffix, depth_of) in product(SETS.items(), predictors.items()):
         if any(f"{{{place}}}" in overrides and not getattr(options, place) for place in ("shared", "infinigen")):
             continue
-        rows = [measure(network, batch) for batch in batches(overrides.format(**vars(options)))]
+        rows = [measure(depth_of, batch) for batch in batches(overrides.format(**vars(options)))]
         figures = {key: sum(row[key] for row in rows) / len(rows) for key in rows[0]}
         for kind in KINDS:  # the parts of abs_rel of all windows, to means over the pixels of that kind
             figures[f"abs_rel {kind}"] = figures.pop(f"error {kind}") / max(figures[f"share {kind}"], 1e-9)
