@@ -33,7 +33,7 @@ from vg2gt.data.transforms import reduce_to_fit, to_bytes
 from vg2gt.inputs.distinct import digest
 from vg2gt.inputs.folds import unfold
 from vg2gt.inputs.given_cameras import LAYOUTS, SFM_STATE
-from vg2gt.inputs.lenses import lens_texts, own_lenses
+from vg2gt.inputs.lenses import Lenses, lens_texts, own_lenses
 from vg2gt.inputs.likely_pairs import descriptors_of, likely_pairs
 from vg2gt.inputs.motion import check_motion, check_parallax, why_not_placed
 from vg2gt.inputs.pair_evidence import Matches
@@ -202,7 +202,7 @@ def _solve(pictures: Sequence[Picture], folder: Path, key: str, monitor: Monitor
 
 def _models(
     work: Path,
-    lenses: dict[tuple[int, int, float], list[str]],
+    lenses: Lenses,
     names: Sequence[str],
     settings: tuple[int, int, int],
     monitor: Monitor,
@@ -217,12 +217,12 @@ def _models(
     return matches, _map(work, len(names), monitor)
 
 
-def _stage(pictures: Sequence[Picture], work: Path, advance: Any) -> dict[tuple[int, int, float], list[str]]:
+def _stage(pictures: Sequence[Picture], work: Path, advance: Any) -> Lenses:
     """Writes the pictures as numbered upright JPEGs; returns their names by (height, width, focal length or 0).
 
     If any picture has a mask, masks are written for all: to ``masks/`` with COLMAP's names and to ``mask-images/``.
     """
-    lenses: dict[tuple[int, int, float], list[str]] = {}
+    lenses: Lenses = {}
     masks: dict[str, NDArray[np.uint8]] = {}
     (work / "images").mkdir()
     for number, picture in enumerate(pictures):
@@ -263,7 +263,7 @@ def feature_settings(sides: Sequence[int]) -> tuple[int, int, int]:
 
 def find_features(
     work: Path,
-    lenses: dict[tuple[int, int, float], list[str]],
+    lenses: Lenses,
     names: Sequence[str],
     settings: tuple[int, int, int],
     monitor: Monitor,

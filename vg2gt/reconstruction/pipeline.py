@@ -236,14 +236,17 @@ def _place(cameras: Cameras, frame: SceneFrame, pictures: Sequence[Picture]) -> 
     if place is None:
         log.warning("the GPS positions of the photographs are too few or too coarse to give the scene a scale")
         return None
-    axes = (
-        cameras.world_to_camera[0, :, :3, :3].detach().cpu().double().numpy()
-        @ (frame.to_source[:3, :3] / frame.scale).T
-    )
-    if place.is_level and float(((axes[:, 1] + axes[:, 2]) @ place.up).mean()) > _UPSIDE_DOWN:
+    if _upside_down(cameras, frame, place):
         log.warning(
             "the GPS positions of the photographs do not count: by them, the photographs are upside down; are latitude "
             "and longitude swapped, or is east written for west?"
         )
         return None
     return place
+
+
+def _upside_down(cameras: Cameras, frame: SceneFrame, place: Place) -> bool:
+    """Returns whether most source cameras are upside down at a place on the Earth; False if it does not tell up."""
+    rotations = cameras.world_to_camera[0, :, :3, :3].detach().cpu().double().numpy()
+    axes = rotations @ (frame.to_source[:3, :3] / frame.scale).T
+    return place.is_level and float(((axes[:, 1] + axes[:, 2]) @ place.up).mean()) > _UPSIDE_DOWN
