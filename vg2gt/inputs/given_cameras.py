@@ -294,7 +294,7 @@ def _photo(path: Path, camera: NamedCamera, cameras: Path, as_stored: bool = Fal
         if undistortion is None:
             frames = frame_of(shrunk(pixels, wanted), mask)
         else:
-            reduced = undistortion.reduced((pixels.shape[0], pixels.shape[1]))
+            reduced = undistortion_of(photo.lens, (pixels.shape[0], pixels.shape[1]))
             frames = frame_of(reduced.color(pixels), None if mask is None else undistortion.depth(mask))
         height, width = frames.images.shape[-2:]
         matrix = resize_intrinsics(intrinsics, width / photo.width, height / photo.height)

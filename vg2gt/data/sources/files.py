@@ -154,9 +154,9 @@ class FileSource(SceneSource):
         lens, upright = index.lens(row), index.of_image("upright", row, False)
         if not lens:
             return read_color(index.color[row], index.name, index.color_size, upright=upright, least=least)
-        undistortion = undistortion_of(lens)
-        pixels = read_color(index.color[row], index.name, undistortion.lens_size, upright=upright, least=least)
-        return undistortion.reduced((pixels.shape[0], pixels.shape[1])).color(pixels)
+        size = undistortion_of(lens).lens_size
+        pixels = read_color(index.color[row], index.name, size, upright=upright, least=least)
+        return undistortion_of(lens, (pixels.shape[0], pixels.shape[1])).color(pixels)
 
     def read_mask(self, index: SceneIndex, row: int) -> NDArray[np.float32] | None:
         """Reads the pixel weights ``[h, w]`` in [0, 1] of a colour image from its mask file and alpha; None: all 1."""

@@ -107,12 +107,18 @@ class Undistortion:
 
 
 @lru_cache(maxsize=4)
-def undistortion_of(lens: str) -> Undistortion:
-    """Returns the undistortion of a lens in the format of :func:`lens_text`; the last four are cached.
+def undistortion_of(lens: str, reduced: Size | None = None) -> Undistortion:
+    """Returns the undistortion of a lens; the last four are cached.
+
+    Args:
+        lens: the lens in the format of :func:`lens_text`.
+        reduced: ``(height, width)`` of reduced images (:meth:`Undistortion.reduced`); None: of its own size.
 
     Raises:
         ValueError: see :meth:`Undistortion.of`.
     """
+    if reduced is not None:
+        return undistortion_of(lens).reduced(reduced)
     require_pycolmap("undistorting images")
     import pycolmap  # pyright: ignore[reportMissingImports]
 
