@@ -8,7 +8,7 @@ from PIL import Image
 
 from vg2gt.inputs.panoramas import FACES, continues
 from vg2gt.inputs.pictures import find_pictures
-from vg2gt.io.video import write_video
+from vg2gt.io import write_video
 
 SIZE = (256, 512)
 NOTE = '<x:xmpmeta><rdf:Description GPano:ProjectionType="equirectangular" {}/></x:xmpmeta>'

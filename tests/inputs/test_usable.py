@@ -1,4 +1,4 @@
-"""Images that show nothing are left out by name, black borders are masked."""
+"""Images that show nothing are left out by name, borders are masked."""
 
 from pathlib import Path
 
@@ -258,10 +258,63 @@ def test_black_borders_are_masked(tmp_path: Path, suffix: str, caplog) -> None:
         pixels[200:400, 400 + 20 * number : 550] = 0  # something black that is no border
         Image.fromarray(pixels).save(tmp_path / f"{number}.{suffix}", quality=95)
     found = usable_pictures(find_pictures(tmp_path), Monitor())
-    assert "3 images have black borders" in caplog.text
+    assert "3 images have borders of one colour" in caplog.text
     for size in (shape, (96, 144)):
         mask = found[1].read(size).mask[0]
         expected = torch.from_numpy(~outside).float()[None, None]
         inside = torch.nn.functional.interpolate(expected, mask.shape, mode="area")[0, 0]
         assert mask[inside == 0].max() == 0
         assert mask[inside == 1].mean() > 0.97
+
+
+@pytest.mark.parametrize("every", [1, 3])
+@pytest.mark.parametrize(
+    ("color", "widths"),
+    [
+        (255, (40, 40, 40, 40)),
+        ((250, 248, 240), (30, 120, 30, 30)),
+        ((180, 30, 30), (60, 60, 0, 0)),
+        (0, (0, 0, 400, 400)),
+    ],
+)
+def test_frames_and_bars_are_masked(tmp_path: Path, color, widths: tuple[int, ...], every: int, caplog) -> None:
+    """Passe-partouts, prints of instant cameras, letterboxes, films on end; also if a third of the images has them."""
+    shape, (top, bottom, left, right) = (640, 960), widths
+    for number in range(9):
+        pixels = np.full((*shape, 3), color, np.uint8)
+        inside = (slice(top, 640 - bottom), slice(left, 960 - right))
+        if number % every:
+            inside = (slice(None), slice(None))
+        pixels[inside] = scenery(number, shape)[inside]
+        Image.fromarray(pixels).save(tmp_path / f"{number}.jpg", quality=80)
+    found = usable_pictures(find_pictures(tmp_path), Monitor())
+    assert f"{9 // every} images have borders of one colour" in caplog.text
+    for number, picture in enumerate(found):
+        mask = picture.read(shape).mask
+        if number % every:
+            assert mask is None
+            continue
+        outside = torch.ones(shape, dtype=torch.bool)
+        outside[top : 640 - bottom, left : 960 - right] = False
+        assert mask[0][outside].max() == 0
+        assert mask[0][~outside].mean() > 0.92
+
+
+@pytest.mark.parametrize("color", [255, 128, (40, 90, 200)])
+def test_plain_backgrounds_are_not_taken_for_frames(tmp_path: Path, color, caplog) -> None:
+    """A vase on a turntable, a book that is filmed from above, a band of trees between sky and snow."""
+    y, x = np.mgrid[:240, :320]
+    shown = {
+        "vase": lambda _: (abs(x - 160) < 40 + 25 * np.sin(y / 30)) & (y > 40) & (y < 200),
+        "book": lambda number: (abs(x - 160 - 3 * number) < 80) & (abs(y - 120 - 2 * number) < 60),
+        "trees": lambda number: (y > 80 + number) & (y < 160 + 5 * np.sin(x / 20 + number)),
+    }
+    for name, mask in shown.items():
+        (tmp_path / name).mkdir()
+        for number in range(9):
+            pixels = np.where(mask(number)[..., None], scenery(number, (240, 320)), np.uint8(color))
+            Image.fromarray(pixels.astype(np.uint8)).save(tmp_path / name / f"{number}.jpg", quality=92)
+        assert all(
+            picture.read(SHAPE).mask is None for picture in usable_pictures(find_pictures(tmp_path / name), Monitor())
+        )
+    assert "borders" not in caplog.text

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from vg2gt.io import FormatError, read_video, write_video
-from vg2gt.io.video import count_frames, read_frame, video_size
+from vg2gt.io.video import count_frames, read_frame, sharpest_frames, video_size
 
 
 def _frames(count: int = 6, size: tuple[int, int] = (32, 48)) -> list[np.ndarray]:
@@ -141,6 +141,47 @@ def test_the_video_is_read_not_the_preview_before_it(tmp_path: Path) -> None:
     assert count_frames(tmp_path / "two.mkv") == 5
     assert [frame.shape for _, frame in read_video(tmp_path / "two.mkv")] == [(32, 64, 3)] * 5
     assert read_frame(tmp_path / "two.mkv", 3).shape == (32, 64, 3)
+
+
+@pytest.mark.parametrize(("size", "kind", "said"), [(32, 0, True), (24, 0, True), (16, 0, False), (32, 1024, False)])
+def test_a_second_lens_is_said_a_preview_or_cover_not(tmp_path: Path, size: int, kind: int, said: bool, caplog) -> None:
+    av = pytest.importorskip("av")
+    with av.open(str(tmp_path / "two.mp4"), "w") as container:
+        for side, disposition in ((32, 1), (size, kind)):
+            stream = container.add_stream("mjpeg", 10)
+            stream.width, stream.height, stream.pix_fmt = 2 * side, side, "yuvj420p"
+            stream.disposition = disposition
+        for stream in container.streams.video:
+            shown = np.zeros((stream.height, stream.width, 3), np.uint8)
+            container.mux([*stream.encode(av.VideoFrame.from_ndarray(shown, "rgb24")), *stream.encode(None)])
+    assert [number for number, _ in sharpest_frames(tmp_path / "two.mp4", 1, 1)] == [0]
+    assert ("two.mp4 holds 2 videos; number 1 is used" in caplog.text) == said
+
+
+@pytest.mark.parametrize("damaged", [[8], [0, 8, 16]])
+def test_frames_after_a_damaged_one_are_left_out(tmp_path: Path, damaged: list[int], caplog) -> None:
+    """Up to the next key frame, they repeat its errors; all are read if there are no others."""
+    av = pytest.importorskip("av")
+    noise = np.random.default_rng(0).integers(0, 256, (14, 30, 3)).astype(np.uint8)
+    scene = np.array(Image.fromarray(noise).resize((300, 112), Image.Resampling.BICUBIC))
+    path = tmp_path / "damaged.mkv"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", 10, {"g": "8", "bf": "0", "sc_threshold": "0"})
+        stream.width, stream.height, stream.pix_fmt = 160, 112, "yuv444p"
+        images = [av.VideoFrame.from_ndarray(scene[:, n : n + 160].copy(), "rgb24") for n in range(24)]
+        packets = [packet for image in [*images, None] for packet in stream.encode(image)]
+        for number, packet in enumerate(packets):
+            if number in damaged:
+                kept = packet.size // 4
+                noise = np.random.default_rng(1).integers(0, 256, packet.size - kept).astype(np.uint8)
+                packet.update(bytes(packet)[:kept] + noise.tobytes())
+            container.mux(packet)
+    found = {number: pixels() for number, pixels in sharpest_frames(path, 24, 8)}
+    errors = [np.abs(pixels - scene[:, n : n + 160].astype(int)).mean() for n, pixels in found.items()]
+    assert (max(errors) < 12) == (damaged == [8])
+    assert [number // 8 for number in found] == ([0, 0, 0, 2, 2, 2] if damaged == [8] else [0, 0, 0, 1, 1, 2, 2, 2])
+    assert ("damaged.mkv is damaged: 8 of its frames" in caplog.text) == (damaged == [8])
+    assert ("as no others are left" in caplog.text) == (damaged != [8])
 
 
 @pytest.mark.parametrize(

@@ -83,17 +83,25 @@ def test_views_with_cameras_of_others_are_named(ready, tmp_path, caplog) -> None
     assert [record.message.split(" contradict")[0] for record in caplog.records] == ["00012, 00015"]
 
 
-@pytest.mark.parametrize("wrong", [None, "unit", "ray", "inverse"])
+@pytest.mark.parametrize("wrong", [None, "unit", "ray", "inverse", "before", "after"])
 def test_measured_depth_that_contradicts_itself_is_said(ready, tmp_path, caplog, wrong: str | None) -> None:
     source = SyntheticScenes(1, num_frames=8, size=SIZE)
     frames = source.load(source.scenes[0], range(8))
     matrix = frames.intrinsics[0]
     x, y = torch.arange(SIZE[1]), torch.arange(SIZE[0])[:, None]
     ray = (1 + ((x - matrix[0, 2]) / matrix[0, 0]) ** 2 + ((y - matrix[1, 2]) / matrix[1, 1]) ** 2).sqrt()
-    depth = {"unit": frames.depth / 4, "ray": frames.depth * ray, "inverse": 1 / frames.depth}.get(wrong, frames.depth)
+    depth = {
+        "unit": frames.depth / 4,
+        "ray": frames.depth * ray,
+        "inverse": 1 / frames.depth,
+        "before": frames.depth.roll(1, 0),
+        "after": frames.depth.roll(-1, 0),
+    }.get(wrong, frames.depth)
     recording = write_recording(tmp_path, replace(frames, depth=depth))
     reconstruct_with(ready.model, recording, renderer=ready.renderer)
-    assert ("the measured depth of most images contradicts" in caplog.text) == (wrong is not None)
+    assert ("the measured depth of most images contradicts" in caplog.text) == (wrong in ("unit", "ray", "inverse"))
+    assert (f"is that of the image {wrong} them" in caplog.text) == (wrong in ("before", "after"))
+    assert bool(caplog.text) == (wrong is not None)
 
 
 def test_files_carry_it_and_scenes_of_before_are_read(written: Path, stated: Scene, tmp_path: Path) -> None:

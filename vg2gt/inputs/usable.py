@@ -1,8 +1,4 @@
-"""Leaves out pictures that show nothing (damaged, black, blurred, hidden) or nothing new, and masks black borders.
-
-Undistorted photographs have borders that are black in all images of a size and end abruptly. A dark background does
-neither: its edge differs from image to image.
-"""
+"""Leaves out pictures that show nothing (damaged, black, blurred, hidden) or nothing new, and masks borders."""
 
 from __future__ import annotations
 
@@ -14,11 +10,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image
-from scipy import ndimage
 
 from vg2gt.data.base import DataError, Frames
 from vg2gt.data.sources.masks import joined_masks, resized_mask
 from vg2gt.data.transforms import to_bytes
+from vg2gt.inputs.borders import Borders
 from vg2gt.inputs.damaged import name_left_out, reason_of
 from vg2gt.inputs.distinct import Versions, without_copies
 from vg2gt.inputs.pictures import IN_MEMORY, Picture
@@ -40,11 +36,6 @@ _SHOWN = 0.001  # share of the pixels that a mask shows at least
 _WIDE, _HALF, _PAIR = 1.7, 32, 0.9  # shape of stereo pairs, pixels of a half, least correlation of the halves
 _REPEATED = 0.3  # mean difference of 255 of a video's frame from the one before, up to which it is the same
 _FEWEST = 3  # images that are compared with each other
-_BORDER, _LIT = 6, 24  # values of 255 of a border at most, and of the image next to it at least
-_BORDERS = (0.001, 0.6)  # least and largest share of the pixels
-_MARGIN = 2  # masked pixels along a border, where it is blurred by compression
-_EDGE = 2  # further pixels, where the image is lit
-_OFTEN = 0.7  # share of the images, and of the pixels along the border, in which they are
 
 
 @dataclass(frozen=True)
@@ -68,37 +59,10 @@ class _Look:
     is_pair: bool
 
 
-class _Borders:
-    """The brightest value and the number of lit values of each pixel of the images of one size."""
-
-    def __init__(self, shape: tuple[int, ...]) -> None:
-        self.peak, self.lit, self.count = np.zeros(shape, np.uint8), np.zeros(shape, np.int32), 0
-
-    def add(self, brightest: NDArray[np.uint8]) -> None:
-        """Takes an image ``[h, w]`` of the brightest channels."""
-        self.peak = np.maximum(self.peak, brightest)
-        self.lit += brightest > _LIT
-        self.count += 1
-
-    def mask(self) -> NDArray[np.float32] | None:
-        """Returns a mask ``[h, w]``, 0 on black borders; None if there are none."""
-        labels: NDArray[np.int32] = np.zeros(self.peak.shape, np.int32)
-        ndimage.label(self.peak <= _BORDER, output=labels)
-        edge = np.concatenate((labels[0], labels[-1], labels[:, 0], labels[:, -1]))
-        black = np.isin(labels, np.unique(edge[edge > 0]))
-        if self.count < _FEWEST or not _BORDERS[0] <= black.mean() <= _BORDERS[1]:
-            return None
-        near: NDArray[np.bool_] = np.asarray(ndimage.binary_dilation(black, np.ones((3, 3)), iterations=_MARGIN), bool)
-        around: NDArray[np.bool_] = np.asarray(ndimage.binary_dilation(near, np.ones((3, 3)), iterations=_EDGE), bool)
-        ring = around & ~near
-        often = self.lit[ring] >= _OFTEN * self.count
-        return (~near).astype(np.float32) if len(often) and often.mean() >= _OFTEN else None
-
-
 def usable_pictures(pictures: Sequence[Picture], monitor: Monitor) -> list[Picture]:
     """Returns the pictures that can be read and show something; of identical files, only the first.
 
-    Those left out are named in a warning. Black borders, which undistorted photographs have, are masked.
+    Those left out are named in a warning. Borders (:mod:`vg2gt.inputs.borders`) are masked.
 
     Args:
         pictures: the pictures; each is decoded once, at a small size. Long videos are not looked at.
@@ -112,7 +76,7 @@ def usable_pictures(pictures: Sequence[Picture], monitor: Monitor) -> list[Pictu
         return pictures
     looks: dict[str, _Look] = {}
     faults: dict[str, str] = {}
-    borders: dict[tuple[int, int], _Borders] = {}
+    borders: dict[tuple[int, int], Borders] = {}
     versions, before = Versions(pictures), np.zeros((0, 0, 3), np.uint8)
     with monitor.stage("check images", len(pictures)) as advance:
         for picture in pictures:
@@ -129,7 +93,7 @@ def usable_pictures(pictures: Sequence[Picture], monitor: Monitor) -> list[Pictu
                 versions.add(picture, pixels)
                 looks[picture.name] = _look(pixels)
                 if _may_have_borders(picture):
-                    borders.setdefault(picture.size, _Borders(pixels.shape[:2])).add(pixels.max(2))
+                    borders.setdefault(picture.size, Borders(pixels.shape[:2])).add(picture.name, pixels)
             advance()
     faults |= _faults(looks)
     faults |= versions.faults(faults)
@@ -140,13 +104,14 @@ def usable_pictures(pictures: Sequence[Picture], monitor: Monitor) -> list[Pictu
             "their halves, or the scene will be wrong: %s", len(pairs), some(pairs),
         )  # fmt: skip
     name_left_out(faults, len(pictures))
-    masks = {size: mask for size, own in borders.items() if (mask := own.mask()) is not None}
+    masks = {name: mask for own in borders.values() for name, mask in own.masks().items() if name not in faults}
+    if masks:
+        share = 100 * np.mean([1 - mask.mean() for mask in masks.values()])
+        log.warning(
+            "%d images have borders of one colour, %.1f %% of their pixels, which are masked", len(masks), share
+        )
     found = [each for each in pictures if each.name not in faults]
-    bordered = {each.name: masks[each.size] for each in found if _may_have_borders(each) and each.size in masks}
-    if bordered:
-        share = 100 * np.mean([1 - mask.mean() for mask in bordered.values()])
-        log.warning("%d images have black borders, %.1f %% of their pixels, which are masked", len(bordered), share)
-    return [_masked(each, bordered[each.name]) if each.name in bordered else each for each in found]
+    return [_masked(each, masks[each.name]) if each.name in masks else each for each in found]
 
 
 def _may_have_borders(picture: Picture) -> bool:

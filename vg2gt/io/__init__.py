@@ -7,6 +7,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from vg2gt.io.animations import write_video
     from vg2gt.io.cameras_json import NamedCamera, named_cameras, read_cameras_json, write_cameras_json
     from vg2gt.io.colmap import (
         colmap_from_views,
@@ -24,9 +25,10 @@ if TYPE_CHECKING:
     from vg2gt.io.ply import read_gaussian_ply, write_gaussian_ply
     from vg2gt.io.points import write_point_ply
     from vg2gt.io.spz import read_spz, write_spz
-    from vg2gt.io.video import read_video, write_video
+    from vg2gt.io.video import read_video
 
 _NAMES = {
+    "animations": "write_video",
     "cameras_json": "NamedCamera named_cameras read_cameras_json write_cameras_json",
     "colmap": "colmap_from_views colmap_images colmap_intrinsics colmap_pose read_colmap write_colmap",
     "errors": "FormatError",
@@ -37,7 +39,7 @@ _NAMES = {
     "ply": "read_gaussian_ply write_gaussian_ply",
     "points": "write_point_ply",
     "spz": "read_spz write_spz",
-    "video": "read_video write_video",
+    "video": "read_video",
 }
 _HOMES = {name: f"vg2gt.io.{file}" for file, names in _NAMES.items() for name in names.split()}
 

@@ -1,16 +1,11 @@
-"""Frames of videos, and animations of rendered views.
-
-PyAV (FFmpeg's libraries) reads all formats and writes MP4; the extra ``video`` installs it (``pip install
-vg2gt[video]``). Pillow writes GIF.
-"""
+"""Frames of videos, read by PyAV (FFmpeg's libraries), which the extra ``video`` installs."""
 
 from __future__ import annotations
 
 import importlib.util
-import io
 import itertools
-import math
-from collections.abc import Callable, Container, Iterable, Iterator, Sequence
+import logging
+from collections.abc import Callable, Container, Iterator
 from contextlib import contextmanager
 from fractions import Fraction
 from functools import lru_cache
@@ -23,7 +18,6 @@ from PIL import Image
 
 from vg2gt.io.color import coded_to_srgb, needs_conversion
 from vg2gt.io.errors import FormatError
-from vg2gt.io.files import replacing, write_bytes
 from vg2gt.io.images import curvatures
 
 if TYPE_CHECKING:
@@ -32,14 +26,15 @@ if TYPE_CHECKING:
     from av.packet import Packet
     from av.video.stream import VideoStream
 
+log = logging.getLogger(__name__)
+
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".gif")
-_QUALITY = "18"  # constant rate factor of H.264: 0 is lossless, 23 is x264's default
-_PALETTE = 255
-_UNSPECIFIED, _BT709, _BT601 = 2, 1, 5  # matrices from YUV to RGB as PyAV numbers them
-_LIMITED = 1  # range of values of usual videos: 16 to 235
+_UNSPECIFIED, BT709, _BT601 = 2, 1, 5  # matrices from YUV to RGB as PyAV numbers them
+LIMITED = 1  # range of values of usual videos: 16 to 235
 _EXACT = 0x4 | 0x2000 | 0x40000  # FFmpeg's scaler: bicubic, chroma for every pixel, accurate rounding
 _SHARPNESS_SIDE = 640  # longer side of the frames that are compared, in pixels
 _COMBED, _COMBED_IF_SAID = 1.1, 0.9  # difference of neighbouring rows by that of every second one
+_PREVIEW, _COVER = 0.3, 0x400  # share of the used video's pixels that a preview has at most; FFmpeg's flag of covers
 _STANDARD_LINES = 576  # rows of a video in standard definition, at most
 _UNDECODABLE = "no frame of it can be decoded; it is truncated or damaged"
 # Containers that hold all their frames. FFmpeg detects formats by content: a playlist under any name would make it open
@@ -74,7 +69,7 @@ def read_video(path: str | Path, numbers: Container[int] | None = None) -> Itera
     """
     number = -1
     with _opened(path) as container:
-        for number, frame in enumerate(_decoded(container)):
+        for number, (frame, _) in enumerate(_decoded(container)):
             if numbers is None or number in numbers:
                 yield number, _upright(frame, _stream(container))
         if number < 0:
@@ -84,7 +79,8 @@ def read_video(path: str | Path, numbers: Container[int] | None = None) -> Itera
 def sharpest_frames(path: str | Path, count: int, limit: int) -> Iterator[tuple[int, Callable[[], NDArray[np.uint8]]]]:
     """Finds the sharpest frame of each of ``limit`` equal intervals of a video; decodes it once, one frame at a time.
 
-    Frames are compared by their finest detail in the direction in which they have least, which motion blurs.
+    Frames are compared by their finest detail in the direction in which they have least, which motion blurs. Those from
+    a damaged one to the next key frame are left out, unless all are.
 
     Args:
         path: the file.
@@ -98,15 +94,32 @@ def sharpest_frames(path: str | Path, count: int, limit: int) -> Iterator[tuple[
         FormatError: if no frame can be decoded.
         ImportError: if PyAV is not installed.
     """
+    damaged: set[int] = set()
+    found: list[int] = []
+
+    def numbered(container: InputContainer) -> Iterator[tuple[int, VideoFrame]]:
+        for number, (frame, is_damaged) in enumerate(_decoded(container)):
+            if is_damaged:
+                damaged.add(number)
+            yield number, frame
+
     with _opened(path) as container:
-        numbered = enumerate(_decoded(container))
-        found = False
-        for _, frames in itertools.groupby(numbered, lambda pair: min(pair[0] * limit // count, limit - 1)):
-            number, sharpest = max(frames, key=lambda pair: _sharpness(pair[1]))
-            found = True
-            yield number, lambda frame=sharpest: _upright(frame, _stream(container))
-        if not found:
-            raise FormatError(f"{path}: {_UNDECODABLE}")
+        _name_streams(path, container)
+        for _, frames in itertools.groupby(numbered(container), lambda pair: min(pair[0] * limit // count, limit - 1)):
+            number, sharpest = max(frames, key=lambda pair: (pair[0] not in damaged, _sharpness(pair[1])))
+            found.append(number)
+            if number not in damaged:
+                yield number, lambda frame=sharpest: _upright(frame, _stream(container))
+    if not found:
+        raise FormatError(f"{path}: {_UNDECODABLE}")
+    if damaged:
+        log.warning(
+            "%s is damaged: %d of its frames, up to the next key frame each, are %s", path, len(damaged),
+            "used, as no others are left" if damaged.issuperset(found) else "left out",
+        )  # fmt: skip
+    if damaged.issuperset(found):
+        for number, pixels in read_video(path, found):
+            yield number, lambda pixels=pixels: pixels
 
 
 def _sharpness(frame: VideoFrame) -> float:
@@ -152,7 +165,7 @@ def read_frame(path: str | Path, number: int) -> NDArray[np.uint8]:
         raise FormatError(f"{path} has {len(times)} frames, but frame {number} was requested")
     with _opened(path) as container:
         container.seek(times[number], stream=_stream(container))
-        for frame in _decoded(container):
+        for frame, _ in _decoded(container):
             if frame.pts == times[number]:
                 return _upright(frame, _stream(container))
     raise FormatError(f"{path}: frame {number} cannot be decoded; the file is damaged")
@@ -174,6 +187,21 @@ def _stream(container: InputContainer) -> VideoStream:
     return cast("VideoStream", container.streams.best("video"))
 
 
+def _name_streams(path: str | Path, container: InputContainer) -> None:
+    """Warns about further videos in a file, as of a second lens, but not about previews and covers."""
+    used = _stream(container)
+    large = [
+        stream for stream in container.streams.video
+        if stream.width * stream.height > _PREVIEW * used.width * used.height
+        and not int(stream.disposition) & _COVER
+    ]  # fmt: skip
+    if len(large) > 1:
+        log.warning(
+            "%s holds %d videos; number %d is used, which players show: write each into a file of its own to use it",
+            path, len(large), large.index(used) + 1,
+        )  # fmt: skip
+
+
 def _shown(packet: Packet) -> bool:
     """Returns whether a packet holds a frame to show: not the empty last one, nor what a trimmed video skips."""
     return packet.size > 0 and not packet.is_discard
@@ -186,50 +214,6 @@ def _frame_times(path: str | Path, state: int) -> list[int]:
         return sorted(
             packet.pts for packet in container.demux(_stream(container)) if _shown(packet) and packet.pts is not None
         )
-
-
-def write_video(path: str | Path, frames: Iterable[NDArray[np.uint8]], fps: float = 24.0) -> Path:
-    """Writes an animation for browsers (:func:`video_writer`); returns its path."""
-    with video_writer(path, fps) as add:
-        for pixels in frames:
-            add(pixels)
-    return Path(path)
-
-
-@contextmanager
-def video_writer(path: str | Path, fps: float = 24.0) -> Iterator[Callable[[NDArray[np.uint8]], None]]:
-    """Writes an animation frame by frame, atomically: a looping GIF, or H.264 in MP4.
-
-    Args:
-        path: the file, ``.gif`` or ``.mp4``.
-        fps: frames per second; GIF rounds frame durations to 1/100 s, at least 1/50 s.
-
-    Yields:
-        A function that takes a frame, uint8 ``[H, W, 3]``, all of one size; it is not changed. MP4 needs even sizes:
-        an odd last row or column is cropped. A GIF is kept in memory until the end, which an MP4 is not.
-
-    Raises:
-        ValueError: if there are no frames, sizes differ, ``fps`` is not positive, or the suffix is unknown.
-        ImportError: if it is an MP4 and PyAV is not installed.
-    """
-    path = Path(path)
-    encoders = {".gif": _gif_encoder, ".mp4": _mp4_encoder}
-    if not 0 < fps < math.inf:
-        raise ValueError(f"fps must be positive, got {fps}")
-    if path.suffix.lower() not in encoders:
-        raise ValueError(f"{path}: animations are written as .gif or .mp4")
-    shapes: set[tuple[int, ...]] = set()
-    with encoders[path.suffix.lower()](path, fps) as encode:
-
-        def add(pixels: NDArray[np.uint8]) -> None:
-            shapes.add(pixels.shape)
-            if len(shapes) > 1 or pixels.dtype != np.uint8:
-                raise ValueError(f"{path}: frames must be uint8 [H, W, 3] of one size, got {sorted(shapes)}")
-            encode(pixels)
-
-        yield add
-        if not shapes:
-            raise ValueError(f"{path}: expected at least one frame, got none")
 
 
 def require_pyav(purpose: str) -> None:
@@ -260,17 +244,25 @@ def _opened(path: str | Path) -> Iterator[InputContainer]:
         raise FormatError(f"{path}: not a readable video ({error.strerror}); it is damaged or a playlist") from error
 
 
-def _decoded(container: InputContainer) -> Iterator[VideoFrame]:
-    """Decodes the frames of the video stream; damaged packets are skipped."""
+def _decoded(container: InputContainer) -> Iterator[tuple[VideoFrame, bool]]:
+    """Decodes the frames of the video stream; damaged packets are skipped.
+
+    Yields:
+        A frame, and whether it is damaged: frames that follow a damaged one repeat its errors up to a key frame.
+    """
     from av.error import InvalidDataError
 
     _stream(container).thread_type = "AUTO"
+    damaged = False
     for packet in container.demux(_stream(container)):
         try:
             frames = packet.decode()
         except InvalidDataError:
+            damaged = True
             continue
-        yield from frames
+        for frame in frames:
+            damaged = frame.is_corrupt or (damaged and not frame.key_frame)
+            yield frame, damaged
 
 
 def _pixels(frame: VideoFrame, context: VideoCodecContext) -> NDArray[np.uint8]:
@@ -285,7 +277,7 @@ def _pixels(frame: VideoFrame, context: VideoCodecContext) -> NDArray[np.uint8]:
     primaries, transfer = int(context.color_primaries), int(context.color_trc)
     untagged = frame.colorspace == _UNSPECIFIED and "yuv" in frame.format.name
     # as players do: BT.709 in high definition, else BT.601
-    matrix = (_BT709 if lines > _STANDARD_LINES else _BT601) if untagged else None
+    matrix = (BT709 if lines > _STANDARD_LINES else _BT601) if untagged else None
     if not needs_conversion(primaries, transfer):
         shown = frame.reformat(format="rgb24", interpolation=_EXACT, src_colorspace=matrix)
         pixels = shown.to_ndarray().astype(np.uint8, copy=False)
@@ -343,56 +335,3 @@ def _squared(pixels: NDArray[np.uint8], aspect: float) -> NDArray[np.uint8]:
     height, width = pixels.shape[:2]
     size = (round(width * max(aspect, 1)), round(height * max(1 / aspect, 1)))
     return pixels if size == (width, height) else np.asarray(Image.fromarray(pixels).resize(size))
-
-
-@contextmanager
-def _gif_encoder(path: Path, fps: float) -> Iterator[Callable[[NDArray[np.uint8]], None]]:
-    frames: list[NDArray[np.uint8]] = []
-    yield frames.append
-    if frames:
-        write_bytes(path, _gif(frames, fps))
-
-
-def _gif(frames: Sequence[NDArray[np.uint8]], fps: float) -> bytes:
-    """Encodes a GIF with one palette from the whole animation, so that colours do not flicker."""
-    step = max(1, len(frames) // 8)
-    sample = np.concatenate([frame[::2, ::2] for frame in frames[::step]])
-    palette = Image.fromarray(np.ascontiguousarray(sample)).quantize(_PALETTE, Image.Quantize.MEDIANCUT)
-    images = [Image.fromarray(np.ascontiguousarray(frame)).quantize(palette=palette) for frame in frames]
-    buffer = io.BytesIO()
-    duration = max(20, round(100 / fps) * 10)
-    images[0].save(buffer, "GIF", save_all=True, append_images=images[1:], duration=duration, loop=0, optimize=False)
-    return buffer.getvalue()
-
-
-@contextmanager
-def _mp4_encoder(path: Path, fps: float) -> Iterator[Callable[[NDArray[np.uint8]], None]]:
-    require_pyav(f"writing {path.name}")
-    import av
-    from av.error import FFmpegError
-
-    with replacing(path) as temporary:
-        try:
-            with av.open(f"file:{temporary}", "w", format="mp4", options={"movflags": "+faststart"}) as container:
-                # x264's macroblock tree is not deterministic, even on one thread
-                options = {"crf": _QUALITY, "x264-params": "mbtree=0"}
-                stream = container.add_stream("libx264", Fraction(f"{fps:g}"), options)
-                stream.pix_fmt = "yuv420p"
-                context = stream.codec_context
-                context.colorspace = context.color_primaries = context.color_trc = _BT709
-                context.color_range = _LIMITED
-                context.thread_count = 1  # several threads are not deterministic
-
-                def encode(pixels: NDArray[np.uint8]) -> None:
-                    height, width = (side // 2 * 2 for side in pixels.shape[:2])
-                    if not context.is_open:
-                        stream.width, stream.height = width, height
-                    even = np.ascontiguousarray(pixels[:height, :width])
-                    frame = av.VideoFrame.from_ndarray(even, "rgb24")
-                    coded = frame.reformat(format="yuv420p", dst_colorspace=_BT709, dst_color_range=_LIMITED)
-                    container.mux(stream.encode(coded))
-
-                yield encode
-                container.mux(stream.encode(None))
-        except FFmpegError as error:
-            raise OSError(error.errno, error.strerror) from error

@@ -35,11 +35,11 @@ from vg2gt.io import (
     write_tiles,
     write_transforms,
 )
+from vg2gt.io.animations import video_writer
 from vg2gt.io.errors import FormatError, some
 from vg2gt.io.files import portable, whole_folder, write_bytes, write_json
 from vg2gt.io.images import colorize_depth, colorize_normals, grid, to_pixels, write_png
 from vg2gt.io.solid import fuse_solid
-from vg2gt.io.video import video_writer
 from vg2gt.monitor import Monitor
 from vg2gt.outputs.export import exported_views
 from vg2gt.outputs.output_names import DEFAULT, MAPS, OUTPUTS, PREDICTED, check_outputs

@@ -35,7 +35,7 @@ from vg2gt.reconstruction.policy import Quality, Refinement, check_refinement
 from vg2gt.reconstruction.refined import refined_by_policy
 from vg2gt.reconstruction.scene import Scene
 from vg2gt.reconstruction.surroundings import with_surroundings
-from vg2gt.reconstruction.trust import contradicted_depth, odd_views, pixel_trust
+from vg2gt.reconstruction.trust import doubt_of_depth, odd_views, pixel_trust
 from vg2gt.reconstruction.windows import WINDOWS
 from vg2gt.reconstruction.windows.run import WindowRun, device_of, window_model
 from vg2gt.reconstruction.windows.store import window_size
@@ -158,12 +158,8 @@ def reconstruct_with(
             "%s contradict the other images: their cameras may be wrong or belong to other images, or they show "
             "something else; correct their cameras or leave them out", some([scene.names[view] for view in odd], 5),
         )  # fmt: skip
-    if parts.support is not None and (share := contradicted_depth(pictures, parts.support)):
-        log.warning(
-            "the measured depth of most images contradicts that of others, in %.0f %% of their pixels: check that it "
-            "is in the unit of the poses (integers: 1,000 a metre), along the camera's axis rather than the ray, not "
-            "inverse, and of these images and poses", 100 * share,
-        )  # fmt: skip
+    if parts.support is not None and (doubt := doubt_of_depth(pictures, parts.support)):
+        log.warning(doubt)
     return with_surroundings(scene, model.visibility is not None).placed()
 
 
