@@ -1,10 +1,12 @@
 """The whole forward pass on a procedural room with the simulated backbone."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from hydra.errors import InstantiationException
 
 from backends.oracle import OracleBackend
 from tests.training_helpers import full_model, small_config
@@ -13,6 +15,7 @@ from vg2gt.evaluation.protocols import ground_truth_target_cameras, training_cam
 from vg2gt.model import VG2GT, SceneScale, with_scale_of
 from vg2gt.training.loop import Run, build
 from vg2gt.types import Batch
+from vg2gt.visibility import ViewCheck
 
 
 @pytest.fixture(scope="module")
@@ -154,6 +157,25 @@ def test_without_the_switch_the_scale_may_drift(run: Run, batch: Batch) -> None:
     torch.testing.assert_close(change, change[0].expand_as(change))
     assert abs(float(change[0].detach()) - 1) > 1e-4
     torch.nn.init.zeros_(bias)
+
+
+def test_confirmed_depth_is_kept_only_with_the_check_of_views(run: Run, batch: Batch, tmp_path: Path) -> None:
+    model = full_model(run).eval()
+    bias = model.get_parameter("coarse.zero.3.bias")
+    torch.nn.init.constant_(bias, 0.3)
+    model.keep_scale = False
+    changed = model(batch.context.images, batch.context.hints)
+    model.visibility, model.keep_agreed = (
+        ViewCheck(tolerance=0.5, margin=0.9, moved_margin=0.9),
+        True,
+    )  # almost all is confirmed
+    kept = model(batch.context.images, batch.context.hints)
+    model.visibility, model.keep_agreed, model.keep_scale = None, False, True
+    torch.nn.init.zeros_(bias)
+    error = [(found.geometry.depth - found.initial.depth).abs().mean() for found in (changed, kept)]
+    assert 0 < error[1] < 0.3 * error[0]
+    with pytest.raises(InstantiationException, match=r"model\.keep_agreed=true requires model\.visibility"):
+        build(small_config(tmp_path, tmp_path, "+model.keep_agreed=true"))
 
 
 @pytest.mark.parametrize(("most", "held_out", "context"), [(1, 0, 1), (2, 1, 1), (3, 2, 1), (5, 3, 2), (None, 3, 8)])

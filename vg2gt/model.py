@@ -30,7 +30,7 @@ from vg2gt.method.fine import FineModule
 from vg2gt.method.pooled import PooledVoxels
 from vg2gt.profiling import stage
 from vg2gt.types import Cameras, Decoded, Gaussians, Geometry, Hints, Prediction, Tokens, Voxels, check_choice
-from vg2gt.visibility import Support, ViewCheck
+from vg2gt.visibility import Support, ViewCheck, keep_agreed
 
 Background = Literal["mean", "black"]
 ScaleSource = Literal["metric", "focal", "normalize", "groundtruth"]
@@ -260,6 +260,11 @@ class VG2GT(Reconstructor):
         fine: factory of the fine-level voxel module, called with ``token_dims`` and ``patch_size``.
         gaussians: factory of the self-splitting Gaussian head, called with ``in_channels``.
         keep_scale: rescales the enhanced depth to the scale of the backbone's, see :func:`with_scale_of`.
+        keep_agreed: keeps the backbone's depth where other views confirm it
+            (:func:`vg2gt.visibility.keep_agreed`); needs ``visibility``.
+
+    Raises:
+        ValueError: if ``keep_agreed`` is set without ``visibility``.
     """
 
     def __init__(
@@ -272,8 +277,12 @@ class VG2GT(Reconstructor):
         keep_scale: bool = True,
         background: Background = "black",
         visibility: ViewCheck | None = None,
+        keep_agreed: bool = False,
     ) -> None:
         super().__init__(backend, scale, background, visibility)
+        if keep_agreed and visibility is None:
+            raise ValueError("model.keep_agreed=true requires model.visibility, which compares the views")
+        self.keep_agreed = keep_agreed
         dims, patch = backend.token_dims, backend.patch_size
         self.keep_scale = keep_scale
         self.coarse = coarse(token_dims=dims, patch_size=patch) if coarse else None
@@ -342,6 +351,8 @@ class VG2GT(Reconstructor):
         # the camera token is unchanged, so the cameras of the first decoding stay valid
         depth = again.depth * unit[:, None, None, None]
         depth = depth if not self.keep_scale else with_scale_of(initial, depth)
+        if self.keep_agreed and self.visibility is not None:
+            depth = keep_agreed(initial, depth, self.visibility)
         return tokens, Decoded(initial, replace(initial, depth=depth, depth_conf=again.depth_conf), unit)
 
 
