@@ -96,6 +96,20 @@ def test_scale_place_and_up_in_spite_of_outliers() -> None:
     assert np.linalg.norm(found - back, axis=1).max() < 4
 
 
+@pytest.mark.parametrize(("step", "noise"), [(0, 1), (0, 5), (48, 1)])  # metres, noise of altitudes
+def test_altitudes_of_two_references_are_brought_to_one(step: float, noise: float, caplog) -> None:
+    """Half of a circle of 40 m has altitudes above the ellipsoid, the other above sea level."""
+    generator = np.random.default_rng(0)
+    angle = np.arange(30) * np.pi / 15
+    circle = np.stack([40 * np.cos(angle), 40 * np.sin(angle), 20 + 0 * angle], 1)
+    altered = circle + step * np.outer(angle < np.pi, (0, 0, 1))
+    place = fit_place(circle / 37, on_earth(altered + generator.normal(0, (1, 1, noise), circle.shape)))
+    assert place is not None
+    assert place.scale == pytest.approx(37, rel=0.02)
+    assert np.degrees(np.arccos(place.up[2])) < 5
+    assert ("two references, 4" in caplog.text) == (step > 0)
+
+
 def test_positions_that_tell_nothing_or_not_all() -> None:
     """A phone around a bench; a single street, which does not tell what is up; one fix for all photographs."""
     generator = np.random.default_rng(0)

@@ -64,6 +64,9 @@ def write_database(
     dots: Dots,
     detected: float = 0.7,
     hidden: Callable[[int], NDArray[np.bool_]] | None = None,
+    lens: tuple[float, NDArray[np.float64]] = (FOCAL, np.zeros(2)),
+    given: float = FOCAL,
+    own: bool = False,
 ) -> list[str]:
     """Writes features and verified matches of all pairs of images; returns the images' names.
 
@@ -73,32 +76,38 @@ def write_database(
         dots: what is seen from its front side.
         detected: share of the visible points that are features.
         hidden: returns which points are hidden in a view.
+        lens: true focal length, and how far its centre ``[2]`` or ``[V, 2]`` is from the middle of the images.
+        given: focal length that the images are said to have; 0: none.
+        own: each image has a camera of its own.
     """
     import pycolmap
 
     noise, names, labels, sights = np.random.default_rng(3), [], [], []
     with pycolmap.Database.open(path) as database:
-        camera = pycolmap.Camera(
-            model="SIMPLE_RADIAL", width=SIZE[1], height=SIZE[0], params=[FOCAL, SIZE[1] / 2, SIZE[0] / 2, 0]
-        )
-        camera.has_prior_focal_length = True
-        camera.camera_id = database.write_camera(camera)
-        rig = pycolmap.Rig()
-        rig.add_ref_sensor(camera.sensor_id)
-        rig.rig_id = database.write_rig(rig)
+        cameras = []
+        for _ in poses if own else poses[:1]:
+            known = [given or 1.2 * SIZE[1], SIZE[1] / 2, SIZE[0] / 2, 0]
+            camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=SIZE[1], height=SIZE[0], params=known)
+            camera.has_prior_focal_length = given > 0
+            camera.camera_id = database.write_camera(camera)
+            rig = pycolmap.Rig()
+            rig.add_ref_sensor(camera.sensor_id)
+            cameras.append((camera.camera_id, database.write_rig(rig)))
+        middles = np.broadcast_to(np.array(SIZE[::-1]) / 2 + lens[1], (len(poses), 2))
         for number, pose in enumerate(poses):
             inside = dots.positions @ pose[:3, :3].T + pose[:3, 3]
-            pixels = inside[:, :2] / inside[:, 2:] * FOCAL + np.array(SIZE[::-1]) / 2
+            pixels = inside[:, :2] / inside[:, 2:] * lens[0] + middles[number]
             sight = -pose[:3, :3].T @ pose[:3, 3] - dots.positions
             facing = (sight * dots.normals).sum(1) / np.linalg.norm(sight, axis=1)
             seen = (facing > 0.25) & (pixels > 0).all(1) & (pixels < SIZE[::-1]).all(1) & (inside[:, 2] > 0)
             seen &= noise.uniform(size=len(seen)) < detected
             if hidden is not None:
                 seen &= ~hidden(number)
-            image = pycolmap.Image(name=f"{number:06d}.jpg", camera_id=camera.camera_id)
+            camera_id, rig_id = cameras[number if own else 0]
+            image = pycolmap.Image(name=f"{number:06d}.jpg", camera_id=camera_id)
             image.image_id = database.write_image(image)
             frame = pycolmap.Frame()
-            frame.rig_id = rig.rig_id
+            frame.rig_id = rig_id
             frame.add_data_id(image.data_id)
             database.write_frame(frame)
             places = pixels[seen] + noise.normal(0, 0.4, (int(seen.sum()), 2))

@@ -170,6 +170,12 @@ def test_images_of_one_size_and_focal_length_share_a_lens(photos: Path, tmp_path
     expected = 26 * 2500 / np.hypot(36, 24)
     assert [picture.focal for picture in pictures] == [None] * 4 + [pytest.approx(expected)] * 2
     assert focal_length(tmp_path / "nowhere.jpg", (2, 2)) is None
+    for width, is_known in ((4000, True), (4500, False)):  # of the whole photograph: one is resized, the other cropped
+        exif.get_ifd(0x8769).update({0xA002: width, 0xA003: 3000})
+        Image.new("RGB", (2000, 1500)).save(tmp_path / "IMG_21.jpg", exif=exif)
+        assert (focal_length(tmp_path / "IMG_21.jpg", (2000, 1500)) is not None) == is_known
+    exif.get_ifd(0x8769).update({0xA002: 2000, 0xA003: 1500})
+    Image.new("RGB", (2000, 1500)).save(tmp_path / "IMG_21.jpg", exif=exif)
     (tmp_path / "work").mkdir()
     lenses = sfm._stage(pictures, tmp_path / "work", lambda: None)
     assert {key: len(names) for key, names in lenses.items()} == {

@@ -92,3 +92,9 @@ def test_mistakes_end_with_one_line(files: Path) -> None:
         assert message in said
         assert "\n" not in said
     assert not (files / "scene.html").exists()
+
+
+def test_a_folder_that_cannot_be_written_to_is_named_before_the_scene_is_read(files: Path, monkeypatch) -> None:
+    monkeypatch.setattr("vg2gt.io.read_gaussians", lambda *_: pytest.fail("read"))
+    with pytest.raises(SystemExit, match=r"folder .*scene\.ply cannot be written to.*choose another"):
+        run(files / "scene.ply", "--html", files / "scene.ply" / "page.html")

@@ -44,11 +44,14 @@ def run(arguments: argparse.Namespace) -> None:
     from vg2gt.inputs.scene_cameras import cameras_of_scene
     from vg2gt.io import read_gaussians
     from vg2gt.outputs.output_names import LARGE
+    from vg2gt.outputs.outputs import check_folder
     from vg2gt.outputs.saved import renderer_of, scene_file
     from vg2gt.rendering import Renderer
     from vg2gt.viewer import ViewerScene, scene_title, write_viewer_html
 
     file = scene_file(arguments.scene)
+    page = arguments.html or file.with_suffix(".html")
+    check_folder(page.parent, (), overwrite=True)
     known = file.parent / CAMERAS
     source = arguments.cameras or (known if known.is_file() else None)
     if arguments.images is not None and source is None:
@@ -65,7 +68,7 @@ def run(arguments: argparse.Namespace) -> None:
         cameras = cameras_of_scene(read_cameras(source), file, gaussians)
         sources = [source.parent, source.parent / VIEWS] if arguments.images is None else [arguments.images]
         scene = replace(scene, cameras=cameras, pictures=_pictures(cameras, sources))
-    path = write_viewer_html(arguments.html or file.with_suffix(".html"), scene, arguments.levels)
+    path = write_viewer_html(page, scene, arguments.levels)
     print(f"{path}: {len(gaussians)} Gaussians, {path.stat().st_size / 1e6:.1f} MB; open it in a browser")
     if len(gaussians) > LARGE and not arguments.levels:
         print("with --levels, the page of a scene of this size loads and draws only what is needed for a view")

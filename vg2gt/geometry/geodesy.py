@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import cmath
+import logging
 import math
 from dataclasses import dataclass
 
@@ -13,12 +14,17 @@ from scipy.spatial.transform import Rotation
 
 from vg2gt.geometry.alignment import align_points
 
+log = logging.getLogger(__name__)
+
 _EQUATOR, _FLATTENING = 6378137.0, 1 / 298.257223563  # WGS 84, radius in metres
 _FEWEST = 4  # positions
 _DRAWS = 300
 _AGREE = 0.8  # share of the positions that a candidate must fit
 _WITHIN = 3.0  # median distances up to which a position counts
 _SURE = 0.05  # metres within which it always does
+_SEVERAL = 12  # positions from which on altitudes of two references can be told
+_SPLIT = 1 / 3  # of the distances: what remains of them with two references. Of noise alone, about a half remains
+_STEP = 1 / 8  # of the step between the references: the same
 _COARSE = 0.05  # largest relative error of the scale
 _LINE = 1e-3  # width of the positions, relative to their length, up to which they are on a line
 _TILT = 0.05  # largest standard error of the turn about that line, in radians
@@ -89,7 +95,8 @@ def fit_place(centers: NDArray[np.float64], positions: NDArray[np.float64]) -> P
     """Fits a similarity from camera centres to measured positions; outliers do not count.
 
     Candidates are the similarities of three cameras each; the one that fits four fifths of the positions best is fitted
-    again to all positions within three times the median distance.
+    again to all positions within three times the median distance. Altitudes of two references, such as sea level and
+    the ellipsoid, are brought to one, named in a warning.
 
     Args:
         centers: ``[N, 3]`` in the cameras' world.
@@ -107,14 +114,37 @@ def fit_place(centers: NDArray[np.float64], positions: NDArray[np.float64]) -> P
     generator = torch.Generator().manual_seed(0)
     draws = torch.stack([torch.randperm(len(source), generator=generator)[:3] for _ in range(_DRAWS)])
     candidates = align_points(source[draws], target[draws])
-    distances = (candidates.apply(source.expand(_DRAWS, -1, -1)) - target).norm(dim=-1)
-    distance = distances[distances.quantile(_AGREE, 1, interpolation="higher").nan_to_num(torch.inf).argmin()]
-    near = _agreeing(distance)
+    off = candidates.apply(source.expand(_DRAWS, -1, -1)) - target
+    best, score = _best(off)
+    if len(source) >= _SEVERAL and score > _SURE:
+        is_low, steps = _two_levels(off[..., 2])
+        split, left = _best(torch.cat((off[..., :2], off[..., 2:] - steps[..., None]), -1))
+        low, step = is_low[split].numpy(), float(steps[split].max() - steps[split].min())
+        if left < min(_SPLIT * score, _STEP * step) and 1 - _AGREE <= low.mean() <= _AGREE:
+            log.warning(
+                "the altitudes of the positions have two references, %.0f m apart (such as sea level and the "
+                "ellipsoid): %d of %d are raised to the others' reference", step, low.sum(), len(low),
+            )  # fmt: skip
+            return fit_place(centers[known], positions[known] + np.outer(low, (0, 0, step)))
+    near = _agreeing(off[best].norm(dim=-1))
     for _ in range(3):
         fit = align_points(source[None, near], target[None, near])
         near = _agreeing((fit.apply(source[None]) - target).norm(dim=-1)[0])
     place = place_of_points(source[near].numpy(), positions[known][near.numpy()])
     return place if place.scale_error <= _COARSE else None
+
+
+def _best(off: torch.Tensor) -> tuple[int, float]:
+    """Returns the candidate that fits four fifths of the positions best by its offsets ``[C, N, 3]``, and how well."""
+    scores = off.norm(dim=-1).quantile(_AGREE, 1, interpolation="higher").nan_to_num(torch.inf)
+    return int(scores.argmin()), float(scores.min())
+
+
+def _two_levels(heights: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Returns which heights ``[C, N]`` are in the upper of two groups, and the median of each one's group."""
+    is_upper = heights > heights.quantile(torch.tensor([0.1, 0.9], dtype=heights.dtype), 1).mean(0)[:, None]
+    upper, lower = (heights.where(part, torch.nan).nanmedian(1, keepdim=True).values for part in (is_upper, ~is_upper))
+    return is_upper, upper.where(is_upper, lower)
 
 
 def _agreeing(distance: torch.Tensor) -> torch.Tensor:

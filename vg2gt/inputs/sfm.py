@@ -19,6 +19,7 @@ import shutil
 import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,7 +34,7 @@ from vg2gt.data.transforms import reduce_to_fit, to_bytes
 from vg2gt.inputs.distinct import digest
 from vg2gt.inputs.folds import unfold
 from vg2gt.inputs.given_cameras import LAYOUTS, SFM_STATE
-from vg2gt.inputs.lenses import Lenses, lens_texts, own_lenses
+from vg2gt.inputs.lenses import Lenses, is_centre_found, lens_texts, with_right_lenses
 from vg2gt.inputs.likely_pairs import descriptors_of, likely_pairs
 from vg2gt.inputs.motion import check_motion, check_parallax, why_not_placed
 from vg2gt.inputs.pair_evidence import Matches
@@ -167,17 +168,17 @@ def _solve(pictures: Sequence[Picture], folder: Path, key: str, monitor: Monitor
             lenses = _stage(pictures, work, advance)
         names = sorted(name for members in lenses.values() for name in members)
         sides = [max(height, width) for (height, width, _), members in lenses.items() for _ in members]
-        matches, models = _models(work, lenses, names, feature_settings(sides), monitor)
-        if models and (own := own_lenses(models[0], lenses)):
-            log.warning("the focal length changes from image to image (zoom, or crops): each gets a lens of its own")
-            matches, models = _models(work, own, names, feature_settings(sides), monitor)
+        settings = feature_settings(sides)
+        matches, models = with_right_lenses(
+            work / "database.db", lenses, lambda lens, free: _models(work, lens, free, names, settings, monitor)
+        )
         if not models:
             raise ValueError(
                 f"cannot find the cameras of these {len(pictures)} images: {why_not_placed(matches)}; {ADVICE}"
             )
         check_parallax(models[0])
-        folded = models
-        models, undecided = unfold(work / "database.db", matches, models, lambda: _map(work, len(names), monitor))
+        folded, remap = models, partial(_map, work, len(names), monitor, is_centre_found(models[0]))
+        models, undecided = unfold(work / "database.db", matches, models, remap)
         placed, *others = _parts(models)
         _write(models[0], work)
         titles = {name: picture.name for name, picture in zip(names, pictures, strict=True)}
@@ -203,18 +204,19 @@ def _solve(pictures: Sequence[Picture], folder: Path, key: str, monitor: Monitor
 def _models(
     work: Path,
     lenses: Lenses,
+    centre: bool,
     names: Sequence[str],
     settings: tuple[int, int, int],
     monitor: Monitor,
 ) -> tuple[Matches, list[Reconstruction]]:
-    """Returns the matches and the models of images with these lenses; arguments as in :func:`find_features`."""
+    """Returns the matches and models of images with lenses; arguments as in :func:`find_features`, :func:`_map`."""
     (work / "database.db").unlink(missing_ok=True)
     shutil.rmtree(work / "models", ignore_errors=True)
     find_features(work, lenses, names, settings, monitor)
     match_features(work, names, monitor)
     matches = Matches.read(work / "database.db")
     check_motion(matches)
-    return matches, _map(work, len(names), monitor)
+    return matches, _map(work, len(names), monitor, centre)
 
 
 def _stage(pictures: Sequence[Picture], work: Path, advance: Any) -> Lenses:
@@ -284,7 +286,7 @@ def find_features(
     for (height, width, focal), members in lenses.items():
         reader = pycolmap.ImageReaderOptions()
         reader.camera_model = _MODEL
-        if focal:
+        if focal > 0:
             reader.camera_params = f"{focal},{width / 2},{height / 2},0"
         pycolmap.import_images(
             database, images, camera_mode=pycolmap.CameraMode.SINGLE, image_names=members, options=reader
@@ -300,13 +302,9 @@ def find_features(
         for start in range(0, len(names), _AT_ONCE):
             some = list(names[start : start + _AT_ONCE])
             pycolmap.extract_features(
-                database,
-                images,
-                image_names=some,
-                reader_options=masked,
-                extraction_options=options,
+                database, images, image_names=some, reader_options=masked, extraction_options=options,
                 device=pycolmap.Device.cpu,
-            )
+            )  # fmt: skip
             for _ in some:
                 advance()
 
@@ -340,16 +338,18 @@ def match_features(work: Path, names: Sequence[str], monitor: Monitor) -> None:
             advance()
 
 
-def _map(work: Path, count: int, monitor: Monitor) -> list[Reconstruction]:
+def _map(work: Path, count: int, monitor: Monitor, centre: bool = False) -> list[Reconstruction]:
     """Returns the models with enough points that COLMAP's incremental mapper finds, the one with most images first.
 
     The global mapper (``pycolmap.global_mapping``) is not used: on the fox scene it places all 24 photographs with a
     small reprojection error, but a quarter of the path away from their positions, even with calibrated focal lengths.
+    If ``centre``, the lenses need not have theirs in the middle of the images.
     """
     import pycolmap  # pyright: ignore[reportMissingImports]
 
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = 1  # fixed order of sums: reproducible cameras
+    options.ba_refine_principal_point = centre
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
     pycolmap.set_random_seed(SEED)
     (work / "models").mkdir(exist_ok=True)

@@ -78,15 +78,20 @@ def focal_length(path: Path, size: Size) -> float | None:
 
     Args:
         path: the file.
-        size: ``(height, width)`` of the image, which must not be cropped.
+        size: ``(height, width)`` of the image.
 
     Returns:
-        The focal length; None if it is missing or not plausible.
+        The focal length; None if it is missing or not plausible, or the photograph had another aspect ratio: of a crop,
+        the focal length of the whole tells nothing.
     """
     try:
         with open_image(path) as image:
-            film = float(image.getexif().get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.FocalLengthIn35mmFilm, 0))
+            exif = image.getexif().get_ifd(ExifTags.IFD.Exif)
+        film = float(exif.get(ExifTags.Base.FocalLengthIn35mmFilm, 0))
+        width, height = (int(exif.get(tag, 0)) for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight))
     except Exception:  # damaged EXIF data raise various errors
+        return None
+    if min(width, height) > 0 and not same_shape(size, (height, width)) and not same_shape(size, (width, height)):
         return None
     return film * math.hypot(*size) / _FILM_DIAGONAL if 4 <= film <= 2000 else None
 
