@@ -72,7 +72,10 @@ def with_right_lenses(database: Path, lenses: Lenses, mapped: Mapped) -> Found:
     if not found[1]:
         return found
     first = found[1][0]
-    if _is_off_centre(first):  # before zooms, whose centres move little
+    ratios, moved = _with_free_lenses(first)
+    if min(ratios, default=1.0) > _EXPLAINED:  # no lenses explain any image much better
+        return found
+    if _is_off_centre(ratios, moved):  # before zooms, whose centres move little
         for others in (_free(lenses), _free(lenses, each=True)):
             if other := _tried(database, partial(mapped, others, True), lambda models: _is_centred(models, first)):
                 log.warning(
@@ -118,7 +121,7 @@ def _extent(models: Sequence[Reconstruction]) -> tuple[int, int]:
 
 def _is_centred(models: Sequence[Reconstruction], first: Reconstruction) -> bool:
     """Returns whether the largest model has as many images as the first one, and likely lenses of right centres."""
-    if _extent(models)[0] < first.num_reg_images() or _is_off_centre(models[0]):
+    if _extent(models)[0] < first.num_reg_images() or _is_off_centre(*_with_free_lenses(models[0])):
         return False
     return max(_shifts(models[0]).values()) < _FARTHEST
 
@@ -133,15 +136,21 @@ def _shifts(model: Reconstruction) -> dict[str, float]:
     }
 
 
-def _is_off_centre(model: Reconstruction) -> bool:
-    """Returns whether other centres of its lenses explain the images of a model much better."""
+def _with_free_lenses(model: Reconstruction) -> tuple[list[float], list[float]]:
+    """Frees the focal length and the centre of each image: how its error changes, and how far its centre moves."""
     single = _with_own_lenses(model)
     before, middle = _errors(single), _shifts(single)
     _adjust(single, centre=True)
     seen, after, shifts = _focals(single), _errors(single), _shifts(single)
-    ratios = [after[name] / max(before[name], 1e-9) for name in seen]
-    moved = [abs(shifts[name] - middle[name]) for name in seen]
-    return bool(seen) and bool(np.median(ratios) < _CENTRED and np.median(moved) > _SHIFT)
+    return (
+        [after[name] / max(before[name], 1e-9) for name in seen],
+        [abs(shifts[name] - middle[name]) for name in seen],
+    )
+
+
+def _is_off_centre(ratios: Sequence[float], moved: Sequence[float]) -> bool:
+    """Returns whether other centres of its lenses explain the images of a model much better."""
+    return bool(ratios) and bool(np.median(ratios) < _CENTRED and np.median(moved) > _SHIFT)
 
 
 def _doubts_focal(database: Path, models: Sequence[Reconstruction]) -> bool:
