@@ -13,7 +13,7 @@ from backends.positions import uv_embedding
 from vg2gt.geometry.precision import full_precision
 from vg2gt.types import Cameras, Geometry, Tokens
 
-POSITION_WEIGHT = 0.1
+_POSITION_WEIGHT = 0.1
 HIDDEN = 32
 
 
@@ -84,7 +84,7 @@ class DPT(nn.Module):
         patch_size: int = 14,
         rectified_skip: bool = False,
         normalize: bool = True,
-        position_weight: float = POSITION_WEIGHT,
+        position_weight: float = _POSITION_WEIGHT,
         sky: bool = False,
     ) -> None:
         super().__init__()

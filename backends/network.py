@@ -16,17 +16,17 @@ from vg2gt.geometry.precision import autocast_dtype, half_precision_on_gpu
 from vg2gt.geometry.rotations import matrix_to_quat, quat_to_matrix
 from vg2gt.types import Cameras, Geometry, Hints, Tokens
 
-IMAGENET_MEAN = (0.485, 0.456, 0.406)
-IMAGENET_STD = (0.229, 0.224, 0.225)
+_IMAGENET_MEAN = (0.485, 0.456, 0.406)
+_IMAGENET_STD = (0.229, 0.224, 0.225)
 
 
 def normalize_images(images: Tensor) -> Tensor:
     """Normalises images ``[..., 3, H, W]`` in [0, 1] with the ImageNet mean and standard deviation."""
-    mean, std = (images.new_tensor(values)[:, None, None] for values in (IMAGENET_MEAN, IMAGENET_STD))
+    mean, std = (images.new_tensor(values)[:, None, None] for values in (_IMAGENET_MEAN, _IMAGENET_STD))
     return (images - mean) / std
 
 
-MIN_TANGENT = 1e-6  # a field of view of 0 would make the focal length infinite
+_MIN_TANGENT = 1e-6  # a field of view of 0 would make the focal length infinite
 
 
 def encode_pose(transform: Tensor, intrinsics: Tensor, size: tuple[int, int]) -> Tensor:
@@ -52,7 +52,7 @@ def decode_pose(encoding: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor
     transform = torch.cat((top, last), -2)
 
     half = size_tensor(size, encoding.dtype, encoding.device).flip(0) / 2
-    focal = half / torch.tan(encoding[..., [8, 7]] / 2).clamp_min(MIN_TANGENT)
+    focal = half / torch.tan(encoding[..., [8, 7]] / 2).clamp_min(_MIN_TANGENT)
     center = torch.cat((half, half.new_ones(1))).expand(*encoding.shape[:-1], 3)
     axes = torch.diag_embed(torch.cat((focal, torch.zeros_like(focal[..., :1])), -1))[..., :2]
     return transform, torch.cat((axes, center[..., None]), -1)

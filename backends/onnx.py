@@ -35,13 +35,13 @@ Exportable = VGGTBackend | DA3Backend
 
 DESCRIPTION = "backend.json"
 FIELDS = ("name", "licence", "weights", "patch_size", "token_dims", "needs_hints", "decoder")
-ENCODER, DECODER, DECODER_WEIGHTS = "encoder.onnx", "decoder.onnx", "decoder.safetensors"
-REMEDY = "write it with vg2gt export backend=NAME --out FOLDER"
-DECODERS = {kind.__name__: kind for kind in (VGGTDecoder, DA3Decoder)}  # the only classes that are built from a file
+ENCODER, _DECODER, DECODER_WEIGHTS = "encoder.onnx", "decoder.onnx", "decoder.safetensors"
+_REMEDY = "write it with vg2gt export backend=NAME --out FOLDER"
+_DECODERS = {kind.__name__: kind for kind in (VGGTDecoder, DA3Decoder)}  # the only classes that are built from a file
 DECODED = ("depth", "depth_conf", "world_to_camera", "intrinsics")
 CUDA = "CUDAExecutionProvider"
 TRACED = (2, 3, 4, 6)  # traced scenes, views, patch rows, patch columns: all different, none 1
-CHECKED = ((1, 1, 3, 2), (1, 2, 2, 5), (2, 4, 3, 3))
+_CHECKED = ((1, 1, 3, 2), (1, 2, 2, 5), (2, 4, 3, 3))
 TOLERANCE = 1e-3  # relative error; a correct graph differs by about 1e-6, a wrong one by far more than 1e-3
 
 
@@ -102,7 +102,7 @@ def export(backend: Backend, out: Path) -> dict[str, Any]:
         raise ImportError("export needs onnx and onnxscript: pip install 'vg2gt[export]'")
     kind = "VGGTDecoder" if isinstance(backend, VGGTBackend) else "DA3Decoder"
     with torch.device("meta"):
-        names = DECODERS[kind](**backend.network.arguments).state_dict()
+        names = _DECODERS[kind](**backend.network.arguments).state_dict()
     state = backend.network.state_dict()
     description = {
         **backend.identity(),
@@ -128,9 +128,9 @@ def _export_graphs(backend: Exportable, folder: Path) -> dict[str, float]:
     with torch.no_grad():
         inputs = example_inputs(backend, *TRACED)
         export_graph(encoder, inputs, names, tokens, folder / ENCODER)
-        export_graph(decoder, encoder(*inputs), tokens, DECODED, folder / DECODER)
-        sessions = [open_session(folder / file) for file in (ENCODER, DECODER)]
-        for shape in CHECKED:
+        export_graph(decoder, encoder(*inputs), tokens, DECODED, folder / _DECODER)
+        sessions = [open_session(folder / file) for file in (ENCODER, _DECODER)]
+        for shape in _CHECKED:
             inputs = example_inputs(backend, *shape)
             encoded = encoder(*inputs)
             found = _run_session(sessions[0], dict(zip(names, inputs, strict=True)), tokens)
@@ -222,7 +222,7 @@ class OnnxBackend(Backend):
 
     def __init__(self, path: str | None = None, head_chunk: int | None = 8) -> None:
         if path is None:
-            raise ValueError(f"backend=onnx needs backend.path=FOLDER: {REMEDY}")
+            raise ValueError(f"backend=onnx needs backend.path=FOLDER: {_REMEDY}")
         folder = Path(path).expanduser()
         found = _read_description(folder)
         dims = tuple(found["token_dims"])
@@ -269,11 +269,11 @@ def _read_description(folder: Path) -> dict[str, Any]:
     """
     for name in (DESCRIPTION, ENCODER, DECODER_WEIGHTS):
         if not (folder / name).is_file():
-            raise FileNotFoundError(f"{folder} is not an ONNX bundle, {name} is missing: copy all of it, or {REMEDY}")
+            raise FileNotFoundError(f"{folder} is not an ONNX bundle, {name} is missing: copy all of it, or {_REMEDY}")
     content = read_json(folder / DESCRIPTION)
     missing = [name for name in FIELDS if not isinstance(content, dict) or name not in content]
     if missing:
-        raise ValueError(f"{folder / DESCRIPTION} does not describe a bundle, {missing[0]} is missing: {REMEDY}")
+        raise ValueError(f"{folder / DESCRIPTION} does not describe a bundle, {missing[0]} is missing: {_REMEDY}")
     return content
 
 
@@ -281,14 +281,14 @@ def _load_decoder(folder: Path, decoder: Mapping[str, Any]) -> VGGTDecoder | DA3
     """Rebuilds the decoder of a bundle from its ``class`` and ``arguments``.
 
     Raises:
-        ValueError: if the class is not one of :data:`DECODERS`, or the arguments or weights do not fit.
+        ValueError: if the class is unknown, or the arguments or weights do not fit.
     """
     try:
         with torch.device("meta"):
-            module = DECODERS[decoder["class"]](**decoder["arguments"])
+            module = _DECODERS[decoder["class"]](**decoder["arguments"])
     except (KeyError, RuntimeError, TypeError, ValueError) as error:
-        known = " or ".join(DECODERS)
-        raise ValueError(f"{folder / DESCRIPTION} does not describe a {known} ({error!r}): {REMEDY}") from error
+        known = " or ".join(_DECODERS)
+        raise ValueError(f"{folder / DESCRIPTION} does not describe a {known} ({error!r}): {_REMEDY}") from error
     load_strictly(module, read_tensors(folder / DECODER_WEIGHTS), "", (), str(folder / DECODER_WEIGHTS))
     return module
 
@@ -308,7 +308,7 @@ def open_session(file: Path) -> onnxruntime.InferenceSession:
     try:
         return onnxruntime.InferenceSession(str(file), options, providers=providers)
     except Exception as error:  # onnxruntime's own classes have no common base
-        raise ValueError(f"onnxruntime {onnxruntime.__version__} cannot open {file} ({error}): {REMEDY}") from error
+        raise ValueError(f"onnxruntime {onnxruntime.__version__} cannot open {file} ({error}): {_REMEDY}") from error
 
 
 def _run_session(

@@ -23,13 +23,13 @@ from vg2gt.geometry.precision import full_precision
 from vg2gt.geometry.rotations import quat_to_matrix
 from vg2gt.types import Cameras, Geometry, Hints, Tokens
 
-NOISE_GRID = (4, 8)
-SMOOTH_SHARE, VIEW_SHARE = 0.8, 0.6  # 0.8^2 + 0.6^2 = 1
-BLEED_THRESHOLD = 0.02
-INVALID_CONFIDENCE = 1e-3
+_NOISE_GRID = (4, 8)
+_SMOOTH_SHARE, _VIEW_SHARE = 0.8, 0.6  # 0.8^2 + 0.6^2 = 1
+_BLEED_THRESHOLD = 0.02
+_INVALID_CONFIDENCE = 1e-3
 CELLS = 2  # the depth residual has CELLS x CELLS values per patch
-WAVELENGTHS = (1.0, 0.5, 0.25)  # of the position encoding of patches, in median depths
-GEOMETRY_CHANNELS = CELLS * CELLS + 1 + 3 + 3 + 3 + 6 * len(WAVELENGTHS)
+_WAVELENGTHS = (1.0, 0.5, 0.25)  # of the position encoding of patches, in median depths
+_GEOMETRY_CHANNELS = CELLS * CELLS + 1 + 3 + 3 + 3 + 6 * len(_WAVELENGTHS)
 
 
 class OracleBackend(Backend):
@@ -73,8 +73,8 @@ class OracleBackend(Backend):
         seed: int = 0,
     ) -> None:
         pose_noise = 0.1 * depth_noise if pose_noise is None else pose_noise
-        if dim < 2 * GEOMETRY_CHANNELS or dim % 4:
-            raise ValueError(f"backend.dim must be a multiple of 4 and at least {2 * GEOMETRY_CHANNELS}, got {dim}")
+        if dim < 2 * _GEOMETRY_CHANNELS or dim % 4:
+            raise ValueError(f"backend.dim must be a multiple of 4 and at least {2 * _GEOMETRY_CHANNELS}, got {dim}")
         if depth_noise < 0 or pose_noise < 0:
             raise ValueError(f"noise must not be negative: depth_noise {depth_noise}, pose_noise {pose_noise}")
         super().__init__("oracle", patch_size, (dim,) * taps, licence="Apache-2.0 (no weights)", needs_hints=True)
@@ -82,7 +82,7 @@ class OracleBackend(Backend):
         self.pose_noise = pose_noise
         self.response = response
         self.seed = seed
-        image_dim = dim - GEOMETRY_CHANNELS
+        image_dim = dim - _GEOMETRY_CHANNELS
         with seeded_initialisation(seed):
             self.patch_embed = PatchEmbed(patch_size, image_dim)
             self.blocks = nn.ModuleList(ViTBlock(image_dim, 4) for _ in range(taps))
@@ -109,7 +109,7 @@ class OracleBackend(Backend):
             predicted = _bleed(depth * (1 + self.depth_noise * relative))
             error = (predicted / depth.clamp_min(1e-6) - 1).abs()
             confidence = 1 + 4 * torch.exp(-error / max(self.depth_noise, 0.01)) * torch.exp(0.3 * doubt)
-            confidence = torch.where(depth > 0, confidence, INVALID_CONFIDENCE)
+            confidence = torch.where(depth > 0, confidence, _INVALID_CONFIDENCE)
             geometry = _describe_patches(predicted, confidence, cameras, grid)
             patch = self._tokens(images, geometry)
             camera = self.camera_projection(_describe_cameras(cameras, _median_depth(predicted)))
@@ -136,7 +136,7 @@ class OracleBackend(Backend):
         hints, depth, cameras = self._checked(images, hints)
         with full_precision(images):
             depth = depth.float()
-            poses = self._noise(hints, (NOISE_GRID, (1, 1), (6,)), depth)[2]
+            poses = self._noise(hints, (_NOISE_GRID, (1, 1), (6,)), depth)[2]
             return self._predict_cameras(cameras, depth, poses)
 
     def _checked(self, images: Tensor, hints: Hints | None) -> tuple[Hints, Tensor, Cameras]:
@@ -149,10 +149,10 @@ class OracleBackend(Backend):
 
     def _draw(self, hints: Hints, size: tuple[int, int], like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Unit noise of depth ``[B, V, H, W]``, cameras ``[B, V, 6]`` and confidence ``[B, V, H, W]``."""
-        fields, constants, poses, doubt = self._noise(hints, (NOISE_GRID, (1, 1), (6,), size), like)
+        fields, constants, poses, doubt = self._noise(hints, (_NOISE_GRID, (1, 1), (6,), size), like)
         smooth = F.interpolate(fields, size, mode="bicubic", align_corners=True)
         smooth = smooth / smooth.std((-2, -1), keepdim=True)
-        return SMOOTH_SHARE * smooth + VIEW_SHARE * constants, poses, doubt
+        return _SMOOTH_SHARE * smooth + _VIEW_SHARE * constants, poses, doubt
 
     def _noise(self, hints: Hints, shapes: tuple[tuple[int, ...], ...], like: Tensor) -> list[Tensor]:
         """Draws ``[B, V, *shape]`` of every shape, in this order, from one generator per view."""
@@ -200,7 +200,7 @@ def _bleed(depth: Tensor) -> Tensor:
     padded = F.pad(depth, (1, 1, 1, 1), mode="replicate")
     share = F.avg_pool2d((padded > 0).to(depth), 3, 1)
     mean = F.avg_pool2d(padded, 3, 1) / share.clamp_min(1e-6)
-    soft = (mean - depth).abs() > BLEED_THRESHOLD * depth
+    soft = (mean - depth).abs() > _BLEED_THRESHOLD * depth
     return torch.where(soft & (depth > 0), (depth + mean) / 2, depth)
 
 
@@ -225,7 +225,7 @@ def _describe_patches(depth: Tensor, confidence: Tensor, cameras: Cameras, grid:
     place = F.adaptive_avg_pool2d(weighted, grid) / weight.clamp_min(1e-6)
     centers = centers.flatten(0, 1)[..., None, None].expand_as(place)
     ray = F.normalize(place - centers, dim=1)
-    phases = [2 * math.pi / wavelength * place for wavelength in WAVELENGTHS]
+    phases = [2 * math.pi / wavelength * place for wavelength in _WAVELENGTHS]
     waves = [wave for phase in phases for wave in (phase.sin(), phase.cos())]
     described = torch.cat((log_depth, log_confidence, place, ray, centers, *waves), 1)
     described = torch.where(weight > 0, described, 0.0)

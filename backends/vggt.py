@@ -21,8 +21,8 @@ from backends.weights import Weights
 from vg2gt.geometry.precision import full_precision, half_precision_on_gpu
 from vg2gt.types import Cameras, Geometry, Hints, Tokens
 
-IGNORABLE = ("track_head.", "point_head.", "aggregator.patch_embed.mask_token")
-ITERATIONS = 4
+_IGNORABLE = ("track_head.", "point_head.", "aggregator.patch_embed.mask_token")
+_ITERATIONS = 4
 POSE_DIM = 9
 
 
@@ -43,7 +43,7 @@ class _CameraHead(nn.Module):
         """Maps camera tokens ``[B, V, D]`` to pose encodings ``[B, V, 9]`` (camera from world)."""
         token = self.token_norm(camera)
         raw = torch.zeros_like(token[..., :POSE_DIM])
-        for iteration in range(ITERATIONS):
+        for iteration in range(_ITERATIONS):
             # The current estimate is an input of the next iteration, without gradient.
             current = self.empty_pose_tokens.expand_as(raw) if iteration == 0 else raw.detach()
             shift, scale, gate = self.poseLN_modulation(self.embed_pose(current)).chunk(3, -1)
@@ -208,10 +208,10 @@ class VGGTBackend(NetworkBackend):
             )
             network = _VGGTNetwork(aggregator, net.features, net.out_channels, net.camera_depth, net.camera_heads)
             # iterations add up to about the identity pose and fields of view of 1 rad
-            predict(network.camera_head.pose_branch.fc2, [value / ITERATIONS for value in (0, 0, 0, 0, 0, 0, 1, 1, 1)])
+            predict(network.camera_head.pose_branch.fc2, [value / _ITERATIONS for value in (0, 0, 0, 0, 0, 0, 1, 1, 1)])
             return network
 
-        weights = Weights(name, net.licence, pretrained, net.repo, revision, path, seed, ignorable=IGNORABLE)
+        weights = Weights(name, net.licence, pretrained, net.repo, revision, path, seed, ignorable=_IGNORABLE)
         super().__init__(make, weights, net.patch_size, 2 * net.dim, net.taps, head_chunk, freeze)
 
     def encode_checked(self, images: Tensor, hints: Hints | None) -> Tokens:

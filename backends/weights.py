@@ -15,8 +15,8 @@ from torch import Tensor, nn
 from backends.base import seeded_initialisation
 from vg2gt.io.tensors import read_tensors
 
-WEIGHT_FILE = "model.safetensors"
-SHOWN = 500  # characters of torch's message, which lists every tensor
+_WEIGHT_FILE = "model.safetensors"
+_SHOWN = 500  # characters of torch's message, which lists every tensor
 
 Network = TypeVar("Network", bound=nn.Module)
 
@@ -81,7 +81,7 @@ class Weights:
         remedy = f"give backend.path=FILE_OR_FOLDER, or backend.pretrained=false for random ones (repository: {repo})"
         if self.path is not None:
             given = Path(self.path).expanduser()
-            file = given / WEIGHT_FILE if given.is_dir() else given
+            file = given / _WEIGHT_FILE if given.is_dir() else given
             if not file.is_file():
                 raise FileNotFoundError(f"no weights for backend {name} at {file}: {remedy}")
             return file
@@ -90,14 +90,14 @@ class Weights:
         try:
             from huggingface_hub import hf_hub_download  # pyright: ignore[reportMissingImports]
         except ImportError as error:
-            needed = f"backend {name} loads {WEIGHT_FILE} from {repo} with huggingface_hub"
+            needed = f"backend {name} loads {_WEIGHT_FILE} from {repo} with huggingface_hub"
             raise ImportError(f"{needed}: pip install 'vg2gt[hub]', or {remedy}") from error
         print(f"{name}: looking for {repo} on the hub or in its cache", file=sys.stderr)
         logging.getLogger("huggingface_hub").setLevel(logging.ERROR)  # logs several lines per attempt
         try:
-            return Path(hf_hub_download(repo, WEIGHT_FILE, revision=self.revision))
+            return Path(hf_hub_download(repo, _WEIGHT_FILE, revision=self.revision))
         except Exception as error:  # raises its own errors and those of requests and httpx
-            wanted = f"{WEIGHT_FILE} of {repo} (revision {self.revision or 'newest'}) for backend {name}"
+            wanted = f"{_WEIGHT_FILE} of {repo} (revision {self.revision or 'newest'}) for backend {name}"
             reason = " ".join(str(error).split()).rstrip(".")
             check = f"Check the network and the revision, or {remedy}"
             raise FileNotFoundError(f"cannot get {wanted}: {reason}. {check}") from error
@@ -128,4 +128,4 @@ def load_strictly(
         network.load_state_dict({key.removeprefix(prefix): value.float() for key, value in found.items()}, assign=True)
     except RuntimeError as error:
         reason = " ".join(str(error).split())
-        raise ValueError(f"{source} does not fit {type(network).__name__}: {reason[:SHOWN]}") from error
+        raise ValueError(f"{source} does not fit {type(network).__name__}: {reason[:_SHOWN]}") from error

@@ -47,7 +47,7 @@ OmegaConf.register_new_resolver("steps_for", _steps_for, replace=True)
 OmegaConf.register_new_resolver("rate_for", _rate_for, replace=True)
 
 _PACKAGE = Path(__file__).resolve().parent
-ENTRY_POINTS = {"backend": "vg2gt.backends", "data": "vg2gt.datasets"}
+_ENTRY_POINTS = {"backend": "vg2gt.backends", "data": "vg2gt.datasets"}
 """Entry-point group through which packages add options, by configuration group."""
 
 
@@ -59,7 +59,7 @@ def plugin_targets() -> dict[str, dict[str, str]]:
     """
     return {
         group: {entry.name: entry.value.replace(":", ".") for entry in importlib.metadata.entry_points(group=points)}
-        for group, points in ENTRY_POINTS.items()
+        for group, points in _ENTRY_POINTS.items()
     }
 
 

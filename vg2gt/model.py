@@ -34,8 +34,8 @@ from vg2gt.visibility import Support, ViewCheck, keep_agreed
 
 Background = Literal["mean", "black"]
 ScaleSource = Literal["metric", "focal", "normalize", "groundtruth"]
-BACKBONE_PREFIX = "backend."
-SEEN_WEIGHT = 0.01  # weight of pixels with depth in the background colour; pixels without depth have weight 1
+_BACKBONE_PREFIX = "backend."
+_SEEN_WEIGHT = 0.01  # weight of pixels with depth in the background colour; pixels without depth have weight 1
 CANONICAL_FOCAL = 300.0  # appendix A.1: d_metric = f * d_net / 300
 
 
@@ -209,7 +209,7 @@ class Reconstructor(nn.Module, ABC):
         return {name: value for name, value in self.state_dict().items() if self._stored(name)}
 
     def _stored(self, name: str) -> bool:
-        return not (self.backend.frozen and name.startswith(BACKBONE_PREFIX))
+        return not (self.backend.frozen and name.startswith(_BACKBONE_PREFIX))
 
     def load_trained(self, state: Mapping[str, Tensor], backend: Mapping[str, Any] | None) -> None:
         """Loads the trained part, which must be complete and does not contain a frozen backbone.
@@ -222,7 +222,7 @@ class Reconstructor(nn.Module, ABC):
             ValueError: if it was trained on or with another backbone, or does not fit; nothing is loaded then.
         """
         self.check_backend(backend)
-        if self.backend.frozen and any(name.startswith(BACKBONE_PREFIX) for name in state):
+        if self.backend.frozen and any(name.startswith(_BACKBONE_PREFIX) for name in state):
             raise ValueError("the checkpoint holds a trained backbone: use the same backend= with backend.freeze=false")
         present = {name: value.shape for name, value in self.trained_state().items()}
         stored = {name: value.shape for name, value in state.items() if self._stored(name)}
@@ -358,7 +358,7 @@ class VG2GT(Reconstructor):
 
 def background_sums(images: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
     """Returns the weighted colour sum ``[B, 3]`` and the weight sum ``[B, 1]``; their ratio is the background."""
-    weight = torch.where(depth > 0, SEEN_WEIGHT, 1.0)[:, :, None]  # [B, V, 1, H, W]
+    weight = torch.where(depth > 0, _SEEN_WEIGHT, 1.0)[:, :, None]  # [B, V, 1, H, W]
     return (weight * images.detach().float()).sum((1, 3, 4)), weight.sum((1, 3, 4))
 
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import torch
 from torch.profiler import record_function
 
-MIB = 2**20
-BEFORE_HEAD = ("encode", "decode", "coarse", "decode_again")
+_MIB = 2**20
+_BEFORE_HEAD = ("encode", "decode", "coarse", "decode_again")
 
 Listener = Callable[[str], AbstractContextManager[None]]
 _listeners: ContextVar[tuple[Listener, ...]] = ContextVar("listeners", default=())
@@ -41,7 +41,7 @@ def listening(listener: Listener) -> Iterator[None]:
 
 @dataclass
 class Clock:
-    """Wall time of a reconstruction in seconds: ``total``, and ``before_head`` for the stages in ``BEFORE_HEAD``."""
+    """Wall time of a reconstruction in seconds: ``total``, and ``before_head`` for the stages in ``_BEFORE_HEAD``."""
 
     total: float = 0.0
     before_head: float = 0.0
@@ -61,7 +61,7 @@ def clocked(device: torch.device) -> Iterator[Clock]:
     def listener(name: str) -> Iterator[None]:
         begin = now(device)
         yield
-        if name in BEFORE_HEAD:
+        if name in _BEFORE_HEAD:
             clock.before_head += now(device) - begin
 
     begin = now(device)
@@ -86,10 +86,10 @@ def reset_peak_memory(device: torch.device) -> None:
 def peak_memory_mib(device: torch.device) -> float:
     """Returns peak MiB: allocated on the GPU since the reset, or resident in the process; 0 if unknown (Windows)."""
     if device.type == "cuda":
-        return torch.cuda.max_memory_allocated(device) / MIB
+        return torch.cuda.max_memory_allocated(device) / _MIB
     try:
         import resource
     except ImportError:
         return 0.0
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / MIB if sys.platform == "darwin" else peak / 1024
+    return peak / _MIB if sys.platform == "darwin" else peak / 1024

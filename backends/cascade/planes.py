@@ -10,7 +10,7 @@ from torch.nn import functional as F
 
 from backends.sweep.views import camera_distances, choose_sources
 
-COARSE_SOURCES, FINE_SOURCES = 6, 3
+COARSE_SOURCES, _FINE_SOURCES = 6, 3
 _NEAREST = 0.15  # depth of the nearest plane, in baselines
 _BEND = 40.0  # planes nearer than this many baselines are spaced in log-depth, farther ones in inverse depth
 _SPAN = math.log1p(_BEND / _NEAREST)
@@ -49,7 +49,7 @@ def coarse_sources(
     return choose_sources(world_to_camera, intrinsics, size, searched, count, noise)
 
 
-def fine_sources(visible: Tensor, parallax: Tensor, count: int = FINE_SOURCES) -> Tensor:
+def fine_sources(visible: Tensor, parallax: Tensor, count: int = _FINE_SOURCES) -> Tensor:
     """Chooses the best of the coarse sources, greedily, by what they see and the parallax they see it with.
 
     Args:

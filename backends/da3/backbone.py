@@ -15,7 +15,7 @@ from backends.positions import Rotary, grid_positions, remembered, resize_positi
 from backends.vit import FeedForward, PatchEmbed, ViTBlock, first_and_others
 
 ReferenceView = Literal["first", "saddle_balanced"]
-MIN_VIEWS_TO_CHOOSE = 3
+_MIN_VIEWS_TO_CHOOSE = 3
 
 
 class Backbone(nn.Module):
@@ -150,7 +150,7 @@ def _select_reference(tokens: Tensor) -> Tensor:
     low, high = measures.amin(-1, keepdim=True), measures.amax(-1, keepdim=True)
     scaled = (measures - low) / (high - low + 1e-8)
     # Compare as a tensor: a Python comparison would fix the number of views in an export.
-    enough = torch.full((), tokens.shape[1], device=tokens.device) >= MIN_VIEWS_TO_CHOOSE
+    enough = torch.full((), tokens.shape[1], device=tokens.device) >= _MIN_VIEWS_TO_CHOOSE
     return torch.where(enough, (scaled - 0.5).abs().sum(0).argmin(-1), 0)
 
 

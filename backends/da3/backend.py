@@ -19,7 +19,7 @@ from vg2gt.geometry.precision import full_precision, half_precision_on_gpu
 from vg2gt.types import Cameras, Geometry, Hints, Tokens
 
 POSE_DIM = 9
-MIN_MEDIAN_DISTANCE = 0.1
+_MIN_MEDIAN_DISTANCE = 0.1
 
 
 class _CameraDecoder(nn.Module):
@@ -59,7 +59,7 @@ def normalize_cameras(cameras: Cameras) -> Cameras:
     relative = relative_to_first(cameras)
     distance = invert_rigid(relative.world_to_camera)[..., :3, 3].norm(dim=-1)
     # Lower median by sorting, as Tensor.median cannot be exported.
-    unit = distance.sort(-1).values[:, (distance.shape[1] - 1) // 2].clamp_min(MIN_MEDIAN_DISTANCE)
+    unit = distance.sort(-1).values[:, (distance.shape[1] - 1) // 2].clamp_min(_MIN_MEDIAN_DISTANCE)
     poses = relative.world_to_camera.clone()
     poses[..., :3, 3] /= unit[:, None, None]
     return Cameras(poses, relative.intrinsics, relative.size)

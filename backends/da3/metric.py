@@ -20,13 +20,13 @@ from vg2gt.geometry.precision import full_precision, half_precision_on_gpu
 from vg2gt.types import Cameras, Geometry, Hints, Tokens
 
 CANONICAL_FOCAL = 300.0  # pixels at network resolution
-SKY_THRESHOLD = 0.3
-FAR_QUANTILE = 0.99
+_SKY_THRESHOLD = 0.3
+_FAR_QUANTILE = 0.99
 MIN_PIXELS = 10
-NEAREST, NEAREST_METRIC = 1e-3, 1e-2  # minimum depth and metric depth for fitting the scale
-MAX_SAMPLES = 100_000  # for quantiles
-FARTHEST_SKY = 200.0  # metres
-SKY_CONFIDENCE = 1.0  # lower bound of DA3's confidence, 1 + exp
+NEAREST, _NEAREST_METRIC = 1e-3, 1e-2  # minimum depth and metric depth for fitting the scale
+_MAX_SAMPLES = 100_000  # for quantiles
+_FARTHEST_SKY = 200.0  # metres
+_SKY_CONFIDENCE = 1.0  # lower bound of DA3's confidence, 1 + exp
 
 
 class DA3MetricBackend(NetworkBackend):
@@ -102,14 +102,14 @@ def fill_sky(depth: Tensor, sky: Tensor) -> Tensor:
         depth: ``[B, V, H, W]``.
         sky: sky score ``[B, V, H, W]``; sky from 0.3 on.
     """
-    far, is_sky = _far_ends(depth, sky)[:, None, None, None], sky >= SKY_THRESHOLD
+    far, is_sky = _far_ends(depth, sky)[:, None, None, None], sky >= _SKY_THRESHOLD
     enough = is_sky.sum((1, 2, 3), keepdim=True) > MIN_PIXELS
     return torch.where(is_sky & enough & far.isfinite(), far, depth)
 
 
 def quantile(values: Tensor, q: float) -> Tensor:
     """Returns the quantile of a flat tensor, estimated from every n-th value so that at most 100k are used."""
-    return values[:: -(-values.numel() // MAX_SAMPLES)].quantile(q)
+    return values[:: -(-values.numel() // _MAX_SAMPLES)].quantile(q)
 
 
 class DA3NestedBackend(Backend):
@@ -142,8 +142,8 @@ class DA3NestedBackend(Backend):
         metric_tokens = self.metric.encode(images, Hints(cameras=geometry.cameras))
         depth, sky = self.metric.decode_raw(metric_tokens)
         scale = fit_scale(depth * metres(geometry.cameras)[..., None, None], sky, geometry)
-        far = torch.minimum(_far_ends(geometry.depth, sky), FARTHEST_SKY / scale)
-        return replace(tokens, state={**tokens.state, "scale": scale, "sky": sky >= SKY_THRESHOLD, "far": far})
+        far = torch.minimum(_far_ends(geometry.depth, sky), _FARTHEST_SKY / scale)
+        return replace(tokens, state={**tokens.state, "scale": scale, "sky": sky >= _SKY_THRESHOLD, "far": far})
 
     def decode(self, tokens: Tokens) -> Geometry:
         """See :meth:`Backend.decode`."""
@@ -153,7 +153,7 @@ class DA3NestedBackend(Backend):
         return replace(
             geometry,
             depth=torch.where(filled, far, geometry.depth),
-            depth_conf=torch.where(filled, SKY_CONFIDENCE, geometry.depth_conf),
+            depth_conf=torch.where(filled, _SKY_CONFIDENCE, geometry.depth_conf),
             scale=tokens.state["scale"],
         )
 
@@ -172,9 +172,9 @@ def _far_ends(depth: Tensor, sky: Tensor) -> Tensor:
 
     It is NaN for a scene with at most ten such pixels. Arguments as of :func:`fill_sky`.
     """
-    ground = [scene[score < SKY_THRESHOLD] for scene, score in zip(depth, sky, strict=True)]
+    ground = [scene[score < _SKY_THRESHOLD] for scene, score in zip(depth, sky, strict=True)]
     unknown = depth.new_tensor(torch.nan)
-    return torch.stack([quantile(g, FAR_QUANTILE) if len(g) > MIN_PIXELS else unknown for g in ground])
+    return torch.stack([quantile(g, _FAR_QUANTILE) if len(g) > MIN_PIXELS else unknown for g in ground])
 
 
 def fit_scale(metric_depth: Tensor, sky: Tensor, geometry: Geometry) -> Tensor:
@@ -193,10 +193,10 @@ def fit_scale(metric_depth: Tensor, sky: Tensor, geometry: Geometry) -> Tensor:
     """
     factors = []
     for target, depth, confidence, score in zip(metric_depth, geometry.depth, geometry.depth_conf, sky, strict=True):
-        sure = score < SKY_THRESHOLD
+        sure = score < _SKY_THRESHOLD
         if sure.sum() > MIN_PIXELS:
             sure = sure & (confidence >= quantile(confidence[sure], 0.5))
-            sure &= (depth > NEAREST) & (target > NEAREST_METRIC)
+            sure &= (depth > NEAREST) & (target > _NEAREST_METRIC)
             factor = (target[sure] * depth[sure]).sum() / depth[sure].square().sum()
             factors.append(factor if sure.any() else torch.ones_like(factor))
         else:

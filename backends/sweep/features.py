@@ -10,7 +10,7 @@ from torch.nn import functional as F
 
 from backends.sweep.correlate import GROUPS
 
-MATCH_COARSE, MATCH_FINE = 32, 32  # matching channels at 1/4 and 1/2 of the image
+MATCH_COARSE, _MATCH_FINE = 32, 32  # matching channels at 1/4 and 1/2 of the image
 CONTEXT_COARSE, CONTEXT_FINE = 48, 16
 
 
@@ -19,7 +19,7 @@ class Features(NamedTuple):
 
     Attributes:
         coarse: matching features ``[N, MATCH_COARSE, h, w]``, each group of channels of unit length.
-        fine: matching features ``[N, MATCH_FINE, 2 h, 2 w]``, each group of channels of unit length.
+        fine: matching features ``[N, _MATCH_FINE, 2 h, 2 w]``, each group of channels of unit length.
         context: ``[N, CONTEXT_COARSE, h, w]``.
         context_fine: ``[N, CONTEXT_FINE, 2 h, 2 w]``.
     """
@@ -85,7 +85,7 @@ class FeaturePyramid(nn.Module):
         self.merge = conv_norm(48, 48)
         self.merge_half = conv_norm(32, 32)
         self.coarse = nn.Conv2d(48, MATCH_COARSE, 3, 1, 1)
-        self.fine = nn.Conv2d(32, MATCH_FINE, 3, 1, 1)
+        self.fine = nn.Conv2d(32, _MATCH_FINE, 3, 1, 1)
         # no ReLU: it can die in the first steps, and the context with it
         self.context = conv_norm(48, CONTEXT_COARSE, relu=False)
         self.context_fine = conv_norm(32, CONTEXT_FINE, relu=False)

@@ -29,7 +29,7 @@ _BINS = 16  # channels that hold the summed probability of the planes
 _FINE_PLANES = 12
 _FINE_REACH = 1.5  # reach of the second sweep on either side, in plane spacings of the first
 _FARTHEST = 4.0  # maximum swept depth, in multiples of the farthest plane
-WIDE_PLANES = 64  # planes of the sweeps that find the range
+_WIDE_PLANES = 64  # planes of the sweeps that find the range
 _BEYOND = (0.5, 3.0)  # factors on near and far of a hint: the range to search
 _RANGE_CELLS = 2000  # maximum cells per feature map in these sweeps
 _NEARER = 0.6  # near of the second of these sweeps, relative to the near that the first found
@@ -164,11 +164,11 @@ class SweepNet(nn.Module):
         def search(wide: Tensor, fallback: Tensor, least: float = 0.0) -> Tensor:
             """Agreed range of one sweep; ignores positions below ``least`` (0 is far, 1 is near)."""
             chosen = choose_sources(views.world_to_camera, views.intrinsics, views.size, wide, sources)
-            sweep, agreeing = self.coarse(maps, views, wide, chosen, WIDE_PLANES, stride)
+            sweep, agreeing = self.coarse(maps, views, wide, chosen, _WIDE_PLANES, stride)
             counts = (sweep.mass > 0.4) & (sweep.t >= least)
             return agreed_range(1 / to_inverse(sweep.t, wide), agreeing[:, 1:2] * counts, fallback)
 
-        beyond = 1 / (WIDE_PLANES - 1)  # sky and windows agree at any large depth, between the last two planes
+        beyond = 1 / (_WIDE_PLANES - 1)  # sky and windows agree at any large depth, between the last two planes
         if hint is not None:
             found = search(hint * hint.new_tensor(_BEYOND), hint, least=beyond)
             found = torch.stack((torch.minimum(found[0], hint[0]), torch.maximum(found[1], hint[1])))

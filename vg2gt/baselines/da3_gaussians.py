@@ -21,10 +21,10 @@ from vg2gt.model import Background, SceneScale
 from vg2gt.types import Cameras, Gaussians, Geometry, Hints, Tokens
 from vg2gt.visibility import ViewCheck
 
-MIN_SCALE, MAX_SCALE = 1e-5, 30.0  # in SCALE_UNIT times the sum of a pixel's sides
-SCALE_UNIT = 0.1
-SH_DEGREE = 2
-PARTS = (2, 3, 4, 3 * (SH_DEGREE + 1) ** 2, 1, 1)
+MIN_SCALE, MAX_SCALE = 1e-5, 30.0  # in _SCALE_UNIT times the sum of a pixel's sides
+_SCALE_UNIT = 0.1
+_SH_DEGREE = 2
+PARTS = (2, 3, 4, 3 * (_SH_DEGREE + 1) ** 2, 1, 1)
 
 
 class GaussianHead(DPT):
@@ -127,11 +127,11 @@ def place(raw: Tensor, pixels: Pixels, unit: Tensor, own: Tensor, frame: Tensor)
     # Unlike elsewhere, depth is the distance along the ray.
     means = pixels.to_world(F.normalize(rays, dim=-1) * depth[:, None])
     sides = MIN_SCALE + (MAX_SCALE - MIN_SCALE) * torch.sigmoid(scale)
-    scales = SCALE_UNIT * (depth * pixel.sum(-1))[:, None].abs() * sides
+    scales = _SCALE_UNIT * (depth * pixel.sum(-1))[:, None].abs() * sides
     # As in the official code: read (z, w, x, y) of its xyzw as wxyz, rotate to its world, render the xyzw as wxyz.
     quats = multiply_quats(own[pixels.view], F.normalize(rotation, dim=-1).roll(2, -1)).roll(-1, -1)
     quats = multiply_quats(frame[pixels.view], quats)
-    sh = harmonic_gains(SH_DEGREE).to(color) * color.unflatten(-1, (3, -1)).mT
+    sh = harmonic_gains(_SH_DEGREE).to(color) * color.unflatten(-1, (3, -1)).mT
     return Gaussians(
         means=means,
         quats=quats,

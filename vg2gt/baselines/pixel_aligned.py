@@ -22,8 +22,8 @@ from vg2gt.visibility import ViewCheck
 
 MAX_SCALE = 4.0  # footprints
 MIN_SCALE = 1e-2  # footprints: renderers need a finite inverse
-INITIAL_SCALE = 0.5  # footprints
-INITIAL_OPACITY = 0.9
+_INITIAL_SCALE = 0.5  # footprints
+_INITIAL_OPACITY = 0.9
 
 
 class PixelHead(nn.Module):
@@ -65,8 +65,8 @@ class PixelHead(nn.Module):
         self.out = nn.Linear(hidden or in_channels, sum(self.parts))
         nn.init.normal_(self.out.weight, std=0.02)
         nn.init.zeros_(self.out.bias)
-        self.scale_bias = math.log(INITIAL_SCALE / (MAX_SCALE - INITIAL_SCALE))
-        self.opacity_bias = math.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY))
+        self.scale_bias = math.log(_INITIAL_SCALE / (MAX_SCALE - _INITIAL_SCALE))
+        self.opacity_bias = math.log(_INITIAL_OPACITY / (1 - _INITIAL_OPACITY))
         self.sh_gain: Tensor
         self.register_buffer("sh_gain", harmonic_gains(sh_degree), persistent=False)
 

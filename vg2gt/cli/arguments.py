@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 folders.register()
 
-OVERRIDE = re.compile(r"(\+\+?|~)?[A-Za-z_][\w./]*=")
+_OVERRIDE = re.compile(r"(\+\+?|~)?[A-Za-z_][\w./]*=")
 MODES = ("solid", "rasterized")
 WATCH = "serve a page that shows the scene meanwhile"
 GROUPS = (
@@ -118,7 +118,7 @@ def _saved(outputs: Mapping[str, str]) -> Callable[[str], list[str]]:
 def separate(argv: Sequence[str] | None) -> tuple[list[str], list[str]]:
     """Splits a command line into flags and ``key=value`` overrides; existing files of that form are no overrides."""
     given = sys.argv[1:] if argv is None else list(argv)
-    overrides = [argument for argument in given if OVERRIDE.match(argument) and not Path(argument).exists()]
+    overrides = [argument for argument in given if _OVERRIDE.match(argument) and not Path(argument).exists()]
     return [argument for argument in given if argument not in overrides], overrides
 
 

@@ -33,9 +33,9 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-PLACE, PLAN, RESULT, TABLE = "captures", "plan.json", "capture.json", "captures.md"
+_PLACE, _PLAN, _RESULT, TABLE = "captures", "plan.json", "capture.json", "captures.md"
 FREE = ("images", "out", "overwrite", "quiet", "watch", "device")  # may differ when the command is given again
-STARTED, DONE, FAILED = "started", "done", "failed"
+STARTED, _DONE, _FAILED = "started", "done", "failed"
 
 
 def reconstruct_each(options: argparse.Namespace, overrides: Sequence[str], run: Run) -> None:
@@ -56,12 +56,12 @@ def reconstruct_each(options: argparse.Namespace, overrides: Sequence[str], run:
     captures = _named(options.images)
     of_hydra = [each for each in overrides if each.lstrip("+~").startswith("hydra")]
     given = vars(options) | {"overrides": [each for each in overrides if each not in of_hydra]}
-    plan = folder / PLACE / PLAN
+    plan = folder / _PLACE / _PLAN
     if not options.overwrite:
         _refuse_other(plan, given)
     write_json(plan, {"options": given, "captures": captures})
     before = [_result(folder / name).get("status") for name in captures]
-    todo = [number for number, status in enumerate(before) if options.overwrite or status != DONE]
+    todo = [number for number, status in enumerate(before) if options.overwrite or status != _DONE]
     todo.sort(key=lambda number: before[number] == STARTED)  # last, as one of them may have ended the process
 
     def job(config: DictConfig) -> None:
@@ -76,7 +76,7 @@ def reconstruct_each(options: argparse.Namespace, overrides: Sequence[str], run:
         hydra.main(version_base="1.3", config_path=config_dir(), config_name=None)(job)()
     results = {name: _result(folder / name) for name in captures}
     print(write_text(folder / TABLE, _table(results)).read_text(), end="")
-    failed = [name for name, result in results.items() if result.get("status") != DONE]
+    failed = [name for name, result in results.items() if result.get("status") != _DONE]
     if failed:
         sys.exit(
             f"{len(failed)} of {len(captures)} captures failed: {', '.join(failed)}; the same command repeats them"
@@ -85,25 +85,25 @@ def reconstruct_each(options: argparse.Namespace, overrides: Sequence[str], run:
 
 def _reconstruct(place: Path, number: int, run: Run) -> None:
     """Reconstructs one capture of the plan in a folder and writes its result."""
-    plan = read_json(place / PLAN)
+    plan = read_json(place / _PLAN)
     name, images = list(plan["captures"].items())[number]
     out = place.parent / name
     options = argparse.Namespace(**plan["options"] | {"images": [images], "out": str(out), "quiet": True})
     options.size = tuple(options.size) if isinstance(options.size, list) else options.size
     options.overwrite = options.overwrite or bool(_result(out))  # what an earlier attempt has left
-    write_json(out / RESULT, {"status": STARTED})
+    write_json(out / _RESULT, {"status": STARTED})
     begin = time.monotonic()
     print(f"\n{name}")
     try:
         scene = run(options, options.overrides)
-        result: dict[str, Any] = {"status": DONE, "images": len(scene.names), "gaussians": len(scene.gaussians)}
+        result: dict[str, Any] = {"status": _DONE, "images": len(scene.names), "gaussians": len(scene.gaussians)}
     except Exception as error:  # whatever it is, the other captures go on
         if isinstance(error, USER_ERRORS):
             log.error("%s: %s", name, error)
         else:
             log.exception("%s failed", name)
-        result = {"status": FAILED, "error": f"{type(error).__name__}: {' '.join(str(error).split())}"}
-    write_json(out / RESULT, result | {"seconds": time.monotonic() - begin})
+        result = {"status": _FAILED, "error": f"{type(error).__name__}: {' '.join(str(error).split())}"}
+    write_json(out / _RESULT, result | {"seconds": time.monotonic() - begin})
 
 
 def _named(images: Sequence[str]) -> dict[str, str]:
@@ -118,8 +118,8 @@ def _named(images: Sequence[str]) -> dict[str, str]:
     found: dict[str, str] = {}
     for path in (each.absolute() for each in listed):
         name = path.stem if path.is_file() else path.name
-        if name in (*found, PLACE):
-            raise ValueError(f"{found.get(name, PLACE)} and {path} would both be written to {name}: rename one")
+        if name in (*found, _PLACE):
+            raise ValueError(f"{found.get(name, _PLACE)} and {path} would both be written to {name}: rename one")
         found[name] = str(path)
     return dict(sorted(found.items()))  # the order of the plan
 
@@ -137,7 +137,7 @@ def _refuse_other(path: Path, options: dict[str, Any]) -> None:
 
 def _result(folder: Path) -> dict[str, Any]:
     """The result of a capture; empty if it was never started."""
-    path = folder / RESULT
+    path = folder / _RESULT
     return read_json(path) if path.is_file() else {}
 
 

@@ -83,7 +83,7 @@ def dispatch(program: str, commands: Mapping[str, Command]) -> None:
     """
     asked = sys.argv[1] if len(sys.argv) > 1 else ""
     if asked in ("", "-h", "--help"):
-        print(listing(program, commands))
+        print(_listing(program, commands))
         sys.exit(0 if asked else 2)
     if asked == "--version":
         print(f"vg2gt {vg2gt.__version__}")
@@ -101,7 +101,7 @@ def dispatch(program: str, commands: Mapping[str, Command]) -> None:
     getattr(command, function)()
 
 
-def listing(program: str, commands: Mapping[str, Command]) -> str:
+def _listing(program: str, commands: Mapping[str, Command]) -> str:
     """Lists the commands, each with a description and an example."""
     lines = [f"usage: {program} COMMAND [arguments]", ""]
     for name, command in commands.items():

@@ -16,7 +16,7 @@ from vg2gt.config import compose
 if TYPE_CHECKING:
     from vg2gt.data.datamodule import SceneDataModule
 
-SPLITS = """
+_SPLITS = """
 key=value arguments choose the dataset as in vg2gt train; the scenes of data.train are split; recordings of one place
 stay together. Use the lists with data.train.scenes=DIR/train.txt data.val.scenes=DIR/val.txt"""
 VIEWS = """
@@ -36,7 +36,7 @@ def main() -> None:
 def splits(argv: Sequence[str] | None = None) -> None:
     """Divides the scenes of a dataset into training and evaluation lists."""
     given, overrides = separate(argv)
-    parser = flag_parser("data splits", SPLITS)
+    parser = flag_parser("data splits", _SPLITS)
     add = parser.add_argument
     add("--out", type=Path, required=True, metavar="DIR", help="where train.txt and val.txt are written")
     add("--fraction", type=float, default=0.1, metavar="X", help="fraction of the places for val.txt, default 0.1")

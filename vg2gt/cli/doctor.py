@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import torch
 
 NEEDED = ("torch", "lightning", "numba", "numpy")
-OPTIONAL = ("triton", "pycolmap", "av", "lzfse", "huggingface_hub", "onnx", "onnxscript", "tensorboard", "wandb")
+_OPTIONAL = ("triton", "pycolmap", "av", "lzfse", "huggingface_hub", "onnx", "onnxscript", "tensorboard", "wandb")
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -32,7 +32,7 @@ def _findings() -> Iterator[tuple[str, str]]:
     """Yields what is checked and the result."""
     yield "vg2gt", f"{vg2gt.__version__} ({vg2gt.source()}), Python {platform.python_version()}, {platform.platform()}"
     yield "packages", ", ".join(f"{name} {_version(name)}" for name in NEEDED)
-    yield "optional", ", ".join(f"{name} {_version(name)}" for name in OPTIONAL)
+    yield "optional", ", ".join(f"{name} {_version(name)}" for name in _OPTIONAL)
     yield from _folders()
     import torch
 

@@ -14,7 +14,7 @@ from hydra.types import RunMode
 from omegaconf.errors import OmegaConfBaseException
 
 USER_ERRORS = (ValueError, OSError, ImportError, ArithmeticError, MemoryError, HydraException, OmegaConfBaseException)
-TRACEBACK = "HYDRA_FULL_ERROR"
+_TRACEBACK = "HYDRA_FULL_ERROR"
 
 
 @contextmanager
@@ -26,12 +26,12 @@ def errors_in_one_line() -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        if os.environ.get(TRACEBACK):
+        if os.environ.get(_TRACEBACK):
             raise
         print("interrupted", file=sys.stderr)
         sys.exit(128 + signal.SIGINT)
     except Exception as error:
-        if os.environ.get(TRACEBACK) or in_a_sweep() or not isinstance(error, USER_ERRORS):
+        if os.environ.get(_TRACEBACK) or _in_a_sweep() or not isinstance(error, USER_ERRORS):
             raise
         # Hydra wraps errors of constructors: show the original one
         cause = error.__cause__ or error if isinstance(error, InstantiationException) else error
@@ -42,15 +42,15 @@ def errors_in_one_line() -> Iterator[None]:
             said += f"; is a value of the wrong type? The overrides are: {' '.join(HydraConfig.get().overrides.task)}"
         if sys.stderr.isatty():
             print(file=sys.stderr)  # ends a progress bar that was interrupted
-        sys.exit(f"{type(cause).__name__}: {' '.join(said.split())} ({TRACEBACK}=1 shows where)")
+        sys.exit(f"{type(cause).__name__}: {' '.join(said.split())} ({_TRACEBACK}=1 shows where)")
 
 
 def refuse_ranks_in_a_sweep(devices: str) -> None:
     """Refuses several devices in a sweep: ranks repeat the command line, which would start the whole sweep."""
-    if in_a_sweep() and devices != "1" and "LOCAL_RANK" not in os.environ and "SLURM_PROCID" not in os.environ:
+    if _in_a_sweep() and devices != "1" and "LOCAL_RANK" not in os.environ and "SLURM_PROCID" not in os.environ:
         raise ValueError(f"trainer.devices={devices} in a sweep (-m): run its jobs one by one, or with one device each")
 
 
-def in_a_sweep() -> bool:
+def _in_a_sweep() -> bool:
     """Whether this is a job of a sweep (``-m``)."""
     return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN

@@ -9,10 +9,10 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 
 FIRST = "quickstart"
-NAMING = {"data": "synthetic", "backend": "oracle", "model": "tiny"}  # a run with these defaults is named FIRST
-ADDED = ("experiment", "ablation")
+_NAMING = {"data": "synthetic", "backend": "oracle", "model": "tiny"}  # a run with these defaults is named FIRST
+_ADDED = ("experiment", "ablation")
 STARTED_BY_OTHERS = ("LOCAL_RANK", "RANK", "SLURM_PROCID")
-OF_A_RUN = ("config.yaml", "checkpoints", ".lock", "[0-9]*")  # the last: jobs of a sweep
+_OF_A_RUN = ("config.yaml", "checkpoints", ".lock", "[0-9]*")  # the last: jobs of a sweep
 
 
 def register() -> None:
@@ -42,9 +42,9 @@ def run_folder(_root_: DictConfig) -> str:
 
 def chosen(choices: DictConfig) -> str:
     """Joins the options of the groups, such as ``rgbd-oracle-tiny``; ``quickstart`` for the defaults."""
-    names = [choices.get(group) for group in NAMING]
-    added = [choices.get(group) for group in ADDED]
-    if names == list(NAMING.values()) and not any(added):
+    names = [choices.get(group) for group in _NAMING]
+    added = [choices.get(group) for group in _ADDED]
+    if names == list(_NAMING.values()) and not any(added):
         return FIRST
     return "-".join(str(name).replace("/", "_") for name in (*names, *added) if name)
 
@@ -53,7 +53,7 @@ def chosen(choices: DictConfig) -> str:
 def free(name: str) -> str:
     """Returns ``name``, or the first ``name-N`` without a run; cached, so it is the same for all jobs of a sweep."""
     number, candidate = 1, name
-    while any(path for part in OF_A_RUN for path in Path("outputs", candidate).glob(part)):
+    while any(path for part in _OF_A_RUN for path in Path("outputs", candidate).glob(part)):
         number += 1
         candidate = f"{name}-{number}"
     return candidate

@@ -23,7 +23,7 @@ from vg2gt.cli.errors import errors_in_one_line
 from vg2gt.outputs.output_names import DEFAULT, LARGE, OUTPUTS, PREDICTED, TILES, check_outputs
 from vg2gt.reconstruction.windows import WINDOWS
 
-USAGE = "vg2gt reconstruct IMAGES... --out DIR [options] [KEY=VALUE ...]"
+_USAGE = "vg2gt reconstruct IMAGES... --out DIR [options] [KEY=VALUE ...]"
 DETAILS = """
 KEY=VALUE sets model, backend, renderer and refinement: backend=da3_small,
 model.fine.max_voxels=500000, refine.full.size=1008"""
@@ -52,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def _parser() -> argparse.ArgumentParser:
     """Returns the parser of the options, which its help groups by what they are about."""
-    parser = flag_parser("reconstruct", DETAILS, USAGE)
+    parser = flag_parser("reconstruct", DETAILS, _USAGE)
     parser.add_argument("images", nargs="+", metavar="IMAGES", help="image files, a folder of them, a video, or a "
         "recording with known cameras")  # fmt: skip
     add = parser.add_argument_group("input").add_argument

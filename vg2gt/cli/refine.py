@@ -11,7 +11,7 @@ from vg2gt.cli.arguments import WATCH, add_common_flags, flag_parser, separate, 
 from vg2gt.cli.errors import errors_in_one_line
 from vg2gt.outputs.output_names import DEFAULT, OUTPUTS, check_outputs
 
-HOW = """
+_HOW = """
 refine=NAME selects a file of configs/refine, refine.KEY=VALUE changes a key.
 Default: photographs, or default for RGB-D recordings."""
 ADVICE = "fewer or smaller images (vg2gt reconstruct --max-images, --size) or fewer Gaussians"
@@ -19,7 +19,7 @@ ADVICE = "fewer or smaller images (vg2gt reconstruct --max-images, --size) or fe
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Runs the command; errors are reported in one line."""
-    arguments = flag_parser("refine", HOW)
+    arguments = flag_parser("refine", _HOW)
     add = arguments.add_argument
     add("scene", metavar="DIR", help="a folder that vg2gt reconstruct has written")
     add("--out", metavar="DIR", help="where to write; default: refined/ in the scene's folder")

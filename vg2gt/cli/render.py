@@ -15,7 +15,7 @@ from vg2gt.outputs.output_names import FPS, MAPS, check_outputs
 
 OUTPUTS = {**MAPS, "video.gif": "the colour of all views as an animation", "video.mp4": "the same as H.264"}
 DEFAULT, MOVING = ("color.png",), ("video.mp4",)
-COLORS = {"color.png", "video.gif", "video.mp4"}  # outputs that need no depth and normals
+_COLORS = {"color.png", "video.gif", "video.mp4"}  # outputs that need no depth and normals
 CAMERAS = "cameras.json"  # next to the scene, as vg2gt reconstruct writes it
 _NOTES = {
     "orbit": "an orbit around what the cameras look at",
@@ -100,7 +100,7 @@ def run(options: argparse.Namespace) -> None:
     else:
         path = CameraPath(cameras_of_scene(still, scene, gaussians), options.fps or FPS, "views")
     cameras, fps = path.cameras, path.fps
-    if not set(outputs) - COLORS:
+    if not set(outputs) - _COLORS:
         renderer = replace(renderer, geometry=False)
     folder.mkdir(parents=True, exist_ok=True)
     sinks = [map_folder(folder, name) for name in outputs if name in MAPS]

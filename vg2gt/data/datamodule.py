@@ -22,12 +22,12 @@ from vg2gt.data.views.even import EvaluationViews, spread
 from vg2gt.data.views.sampling import StepSampler, ViewSampler, usable_scenes
 from vg2gt.types import Batch
 
-PIXEL_BYTES = 4 * (3 + 1 + 1)  # float32 colour, depth and the mask of some datasets
+_PIXEL_BYTES = 4 * (3 + 1 + 1)  # float32 colour, depth and the mask of some datasets
 
 MOST = 16  # worker limit: more would wait for the disk
-PREFETCHED = 2  # batches prefetched by each worker: torch's default
-PROCESS_MB = 600  # memory of a worker without its decoded frames
-SHARED_MEMORY = Path("/dev/shm")  # workers pass batches to the trainer through it
+_PREFETCHED = 2  # batches prefetched by each worker: torch's default
+_PROCESS_MB = 600  # memory of a worker without its decoded frames
+_SHARED_MEMORY = Path("/dev/shm")  # workers pass batches to the trainer through it
 
 
 class SceneDataModule(LightningDataModule):
@@ -194,7 +194,7 @@ class SceneDataModule(LightningDataModule):
             return 0  # the cores are busy with training
         height, width = self.image_size
         views = self.sampler.max_images * (1 + self.sampler.target_views / self.sampler.min_views)
-        return automatic_workers(trainer.num_devices, self.memory_mb, views * height * width * PIXEL_BYTES / 1e6)
+        return automatic_workers(trainer.num_devices, self.memory_mb, views * height * width * _PIXEL_BYTES / 1e6)
 
     def _loader(self, dataset: BatchDataset, sampler: object) -> DataLoader[Batch]:
         trainer, workers = self.trainer, self.loader_processes
@@ -233,8 +233,8 @@ def automatic_workers(ranks: int, memory_mb: int, batch_mb: float) -> int:
     limits = [MOST, cores // ranks - 1]
     if hasattr(os, "sysconf"):
         half = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2e6
-        limits.append(int(half / ranks / (memory_mb + PROCESS_MB + PREFETCHED * batch_mb)))
-    if SHARED_MEMORY.is_dir():  # small in containers; a process that exceeds it dies with a bus error
-        free = shutil.disk_usage(SHARED_MEMORY).free / 1e6
-        limits.append(int(free / ranks / (2 * PREFETCHED * batch_mb)))  # half each for training and evaluation
+        limits.append(int(half / ranks / (memory_mb + _PROCESS_MB + _PREFETCHED * batch_mb)))
+    if _SHARED_MEMORY.is_dir():  # small in containers; a process that exceeds it dies with a bus error
+        free = shutil.disk_usage(_SHARED_MEMORY).free / 1e6
+        limits.append(int(free / ranks / (2 * _PREFETCHED * batch_mb)))  # half each for training and evaluation
     return max(0, min(limits))

@@ -22,8 +22,8 @@ from vg2gt.uncertainty import Samples, calibrate
 
 log = logging.getLogger(__name__)
 
-SPREAD = 1.5  # N views are chosen from SPREAD * N consecutive frames
-PIXELS = 10_000  # of a scene, at most
+_SPREAD = 1.5  # N views are chosen from _SPREAD * N consecutive frames
+_PIXELS = 10_000  # of a scene, at most
 
 
 def make_calibration(config: DictConfig) -> Path:
@@ -38,7 +38,7 @@ def make_calibration(config: DictConfig) -> Path:
     counts, checkpoint = view_counts(config.views), checkpoint_path(config.ckpt)
     if config.out is None and checkpoint is None:
         raise ValueError("without a checkpoint there is no place for the calibration: give out=FILE.json")
-    selection = ViewSelection(targets=0, spread=SPREAD)
+    selection = ViewSelection(targets=0, spread=_SPREAD)
     parts = resolve_parts(config, checkpoint)
     datamodule: SceneDataModule = instantiate(config.data)
     data = datamodule.evaluation_data()
@@ -62,7 +62,7 @@ def make_calibration(config: DictConfig) -> Path:
             prediction = model(batch.images, with_pose_noise(batch, config.pose_noise))
         pixels = pixels_with_errors(prediction, prediction.supported, batch, model.backend.predicts_cameras, number)
         drawn = torch.randperm(len(pixels.error), generator=torch.Generator().manual_seed(number))
-        found.append(pixels.select(drawn[:PIXELS].sort().values))
+        found.append(pixels.select(drawn[:_PIXELS].sort().values))
         log.info("scene %d of %d: %s, %d views", number + 1, len(chosen), sample.scene, len(sample.context))
     path = Path(config.out) if config.out is not None else calibration_path(checkpoint)  # pyright: ignore
     made = calibrate(Samples.joined(found), made_for(model))

@@ -21,7 +21,7 @@ from vg2gt.runs.untrusted import check_targets, read_run_config
 
 log = logging.getLogger(__name__)
 
-UNCHECKED = "cannot check whether the evaluated scenes were used for training: %s"
+_UNCHECKED = "cannot check whether the evaluated scenes were used for training: %s"
 
 
 def refuse_training_views(checkpoint: Path | None, source: SceneSource, views: Sequence[SceneSample]) -> None:
@@ -41,7 +41,7 @@ def refuse_training_views(checkpoint: Path | None, source: SceneSource, views: S
             trained: SceneDataModule = instantiate(run.data)
             train = trained.train_source()
         except (OSError, ValueError, ImportError, InstantiationException) as error:
-            log.warning(UNCHECKED, error)
+            log.warning(_UNCHECKED, error)
             continue
         refuse_overlap(train, list(train.scenes)[: trained.train_scenes], source, views)
 
@@ -62,14 +62,14 @@ def _ancestry(checkpoint: Path | None) -> Iterator[tuple[Path, DictConfig]]:
             try:
                 run = read_run_config(each)
             except (OSError, ValueError) as error:
-                log.warning(UNCHECKED, error)
+                log.warning(_UNCHECKED, error)
                 continue
             yield each, run
             for before in (run.get("init_from"), run.get("ckpt")):
                 try:
                     waiting += [] if before in RESUMED_IN_PLACE else [checkpoint_path(str(before))]
                 except FileNotFoundError:
-                    log.warning(UNCHECKED, f"{each}: the run started from {before}, which is not there")
+                    log.warning(_UNCHECKED, f"{each}: the run started from {before}, which is not there")
 
 
 def refuse_without_hints(model: Reconstructor, source: SceneSource) -> None:

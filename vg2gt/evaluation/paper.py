@@ -9,11 +9,11 @@ from typing import Any
 
 from vg2gt.io.files import read_json
 
-TABLES = Path(__file__).resolve().parent / "paper_tables.json"
+_TABLES = Path(__file__).resolve().parent / "paper_tables.json"
 OURS = "VG2GT"
 MODES = {OURS: "solid", f"{OURS}(3DGS)": "rasterized"}  # rows of the paper -> rendering mode
-RESOLUTION = (518, 518)
-ALIGNMENT = "median"
+_RESOLUTION = (518, 518)
+_ALIGNMENT = "median"
 SOURCES = {  # data sets of the paper -> classes that read them
     "replica": ("Replica",),
     "dtu": ("DTU",),
@@ -28,7 +28,7 @@ NORMALS, UNIFORMITY = "tbl_camera_orientation", "tbl_point_uniformity"
 @lru_cache(maxsize=1)
 def tables() -> Mapping[str, Any]:
     """The tables as ``{LaTeX label: {data set: {method: metrics}}}``; some have metrics per number of views."""
-    return read_json(TABLES)
+    return read_json(_TABLES)
 
 
 def obstacle(dataset: str, settings: Mapping[str, Any]) -> str | None:
@@ -42,11 +42,11 @@ def obstacle(dataset: str, settings: Mapping[str, Any]) -> str | None:
     size, alignment = settings["size"], settings["alignment"]
     if settings["data"] not in SOURCES.get(dataset, ()):
         return f"the data is read by {settings['data']}, which is not the paper's {dataset}"
-    if tuple(size) != RESOLUTION:
+    if tuple(size) != _RESOLUTION:
         return f"images are {size[0]}x{size[1]}, the paper's 518x518"
-    if alignment != ALIGNMENT or any(bound is not None for bound in settings["depth_range"]):
+    if alignment != _ALIGNMENT or any(bound is not None for bound in settings["depth_range"]):
         return (
-            f"depth is aligned by {alignment} within {settings['depth_range']}, the paper's by {ALIGNMENT} without "
+            f"depth is aligned by {alignment} within {settings['depth_range']}, the paper's by {_ALIGNMENT} without "
             "bounds"
         )
     return "the backbone is given true depth or cameras" if settings["told"] else None

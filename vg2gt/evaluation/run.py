@@ -42,12 +42,12 @@ log = logging.getLogger(__name__)
 # Settings of samples, pictures and folders. All others affect the metrics and must be the same within a folder.
 FREE = ("views", "name", "output_dir", "overwrite", "ckpt", "device", "evaluation.pictures", "data.eval_scenes")
 FREE += ("data.workers", "data.memory_mb", "data.steps_per_epoch")
-REFINEMENT = ("refine.", "evaluation.refine")  # have no effect without refinement
+_REFINEMENT = ("refine.", "evaluation.refine")  # have no effect without refinement
 
 IDENTITY = "identity.json"
-FOLDERS = ("scenes", "pictures")
-REPORTS = ("metrics.json", "metrics.md")
-WRITTEN = (*FOLDERS, *REPORTS, "config.yaml")
+_FOLDERS = ("scenes", "pictures")
+_REPORTS = ("metrics.json", "metrics.md")
+_WRITTEN = (*_FOLDERS, *_REPORTS, "config.yaml")
 
 
 @memory_advice(EVALUATION)
@@ -152,7 +152,7 @@ def _identity(
 ) -> dict[str, Any]:
     """All settings that affect the metrics of a sample, flattened; the device affects times."""
     settings = flatten(OmegaConf.to_container(config, resolve=True))
-    free = FREE if config.evaluation.refine else (*FREE, *REFINEMENT)
+    free = FREE if config.evaluation.refine else (*FREE, *_REFINEMENT)
     kept = {key: value for key, value in settings.items() if not key.startswith(free)}
     kept |= {f"weights.{key}": value for key, value in model.backend.identity().items()}
     where = torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
@@ -226,7 +226,7 @@ class ResultStore:
     def __init__(self, folder: Path, identity: Mapping[str, Any], overwrite: bool = False) -> None:
         self.folder = folder
         if not (folder / IDENTITY).is_file():
-            foreign = [name for name in WRITTEN if (folder / name).exists()]
+            foreign = [name for name in _WRITTEN if (folder / name).exists()]
             if foreign:
                 raise FileExistsError(
                     f"{folder} holds {', '.join(foreign)}, which do not belong to an evaluation (no {IDENTITY}): "
@@ -234,9 +234,9 @@ class ResultStore:
                 )
         elif overwrite:
             # the report first: an interruption must not leave it next to other settings
-            for name in REPORTS:
+            for name in _REPORTS:
                 (folder / name).unlink(missing_ok=True)
-            for name in FOLDERS:
+            for name in _FOLDERS:
                 shutil.rmtree(folder / name, ignore_errors=True)
         else:
             before = read_json(folder / IDENTITY)

@@ -20,7 +20,7 @@ NORMALS = columns(
 CAMERAS = columns(*(name for name in METRICS if name.startswith(("rra_", "rta_", "auc_"))))
 POINTS = columns("accuracy", "completeness", "chamfer", "precision", "recall", "f_score")
 STATED = columns(*(f"{name}_{level}" for name in ("held", "width") for level in (50, 80, 90, 95)), "ause")
-COST = columns(
+_COST = columns(
     *("cv", "gaussians", "gaussians_per_pixel", "reconstruct_seconds", "head_seconds", "render_seconds"),
     "peak_memory_mib",
 )
@@ -38,9 +38,9 @@ SCENE = columns(
 
 # Paths of a section's metrics -> labels of their rows, after the number of views.
 Paths = Mapping[str, Sequence[str]]
-RENDERED = {f"rendered/{protocol}/{mode}": (protocol, mode) for protocol in PROTOCOLS for mode in MODES}
+_RENDERED = {f"rendered/{protocol}/{mode}": (protocol, mode) for protocol in PROTOCOLS for mode in MODES}
 DECODED = {"decoded/before": ("before",), "decoded/after": ("after",)}
-POINT_CLOUDS = {"points/rendered": ("rendered",), "points/decoded": ("decoded",)}
+_POINT_CLOUDS = {"points/rendered": ("rendered",), "points/decoded": ("decoded",)}
 
 Figures = Mapping[str, float | None]
 Rows = list[tuple[list[str], Figures]]
@@ -68,15 +68,15 @@ def report_markdown(report: Mapping[str, Any]) -> str:
         figures = paper.row(table, dataset, method)
         return [([*key], figures)] if figures else []
 
-    costs = COST | columns("refine_seconds") if settings.get("refinement") else COST
+    costs = _COST | columns("refine_seconds") if settings.get("refinement") else _COST
     normals, decoded, cost = (f"paper, {table}" for table in (paper.NORMALS, paper.DECODED, paper.UNIFORMITY))
     rendered = ("views", "protocol", "rendering")
     scenes = [([scene, views], figures) for views, result in by_views for scene, figures in result["scenes"].items()]
     sections = [
-        _section("Rendered depth", rendered, DEPTH, rows(RENDERED, paper.DEPTH)),
-        _section("Images", rendered, images, rows(RENDERED, paper.IMAGES)),
+        _section("Rendered depth", rendered, DEPTH, rows(_RENDERED, paper.DEPTH)),
+        _section("Images", rendered, images, rows(_RENDERED, paper.IMAGES)),
         _section(
-            "Rendered normals", rendered, NORMALS, rows(RENDERED) + papers_row(paper.NORMALS, "-", normals, "solid")
+            "Rendered normals", rendered, NORMALS, rows(_RENDERED) + papers_row(paper.NORMALS, "-", normals, "solid")
         ),
         _section(
             "Decoded depth of the input views",
@@ -88,7 +88,7 @@ def report_markdown(report: Mapping[str, Any]) -> str:
         ),
         _section("Stated errors of the decoded depth", ("views",), STATED, rows({"stated": ()})),
         _section("Cameras of the input views", ("views",), CAMERAS, rows({"cameras": ()})),
-        _section("Points of the input views", ("views", "depth"), POINTS, rows(POINT_CLOUDS)),
+        _section("Points of the input views", ("views", "depth"), POINTS, rows(_POINT_CLOUDS)),
         _section("Uniformity and cost", ("views",), costs, rows({"scene": ()}) + papers_row(paper.UNIFORMITY, cost)),
         _section("Scenes (solid; held-out views at true poses)", ("scene", "views"), SCENE, scenes),
     ]

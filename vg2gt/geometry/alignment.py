@@ -14,7 +14,7 @@ from vg2gt.geometry.rotations import matrix_to_quat, multiply_quats
 from vg2gt.geometry.spherical_harmonics import rotation_of_coefficients
 from vg2gt.types import Cameras, Gaussians, TensorRecord
 
-SUBSAMPLE = 64
+_SUBSAMPLE = 64
 MIN_DEPTH = 0.01
 
 
@@ -69,7 +69,7 @@ def _nearest_valid_pixels(valid: Tensor) -> Tensor:
 @lru_cache(maxsize=8)
 def _cell_pixels(height: int, width: int, device: torch.device) -> Tensor:
     """Returns the pixels of every cell, nearest to its centre first: ``[cells, most pixels in a cell]``, padded."""
-    rows, columns = min(height, SUBSAMPLE), min(width, SUBSAMPLE)
+    rows, columns = min(height, _SUBSAMPLE), min(width, _SUBSAMPLE)
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     row, column = y * rows // height, x * columns // width
     cell = (row * columns + column).flatten()

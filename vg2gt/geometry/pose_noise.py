@@ -13,7 +13,7 @@ from vg2gt.geometry.cameras import compose, rigid_motions
 from vg2gt.types import Batch, Hints
 
 TURN, SHIFT = 0.004, 0.006  # standard deviations at amount 1, in rad and in median depths
-AMOUNTS = (0.2, 1.5)  # range of the amount, drawn per scene
+_AMOUNTS = (0.2, 1.5)  # range of the amount, drawn per scene
 
 
 def with_pose_noise(batch: Batch, share: float) -> Hints:
@@ -34,7 +34,7 @@ def _motions(scene: Batch, share: float) -> Tensor:
     name = f"{scene.scene[0]}/{scene.frame_ids[0].tolist()}"
     rng = np.random.default_rng(int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big"))
     views = scene.images.shape[1]
-    amount = rng.uniform(*AMOUNTS) * (rng.random() < share)
+    amount = rng.uniform(*_AMOUNTS) * (rng.random() < share)
     known = scene.depth[scene.depth > 0]
     unit = float(known.median()) if len(known) else 0.0
     turns, shifts = rng.normal(0, TURN * amount, (views, 3)), rng.normal(0, SHIFT * amount * unit, (views, 3))

@@ -83,7 +83,7 @@ def check_cameras(pictures: Sequence[Picture], monitor: Monitor, insisted: bool 
     chosen = _neighbours(known, _GROUPS, _out_of_line(known))
     with monitor.stage("check cameras"):
         matches, views = match_pictures(chosen)
-    shares = fitting_shares(matches, views)
+    shares = _fitting_shares(matches, views)
     if better := better_lens(matches, views):
         log.warning(
             "the images fit the cameras of %s better with %s: check it, or find the cameras from the images by "
@@ -167,7 +167,7 @@ def _advice(matches: Matches, views: dict[str, CheckedView], is_opengl: bool) ->
     """Says what is wrong with contradicted cameras, in the axes of their file."""
     for reading, change in _READINGS.items():
         changed = {name: replace(view, pose=change(view.pose)) for name, view in views.items()}
-        if min(fitting_shares(matches, changed).values()) >= _FITTING:
+        if min(_fitting_shares(matches, changed).values()) >= _FITTING:
             swapped = {_INVERSE: _BOTH, _BOTH: _INVERSE} if is_opengl else {}
             return f"They fit if the poses are {swapped.get(reading, reading)}: correct them"
     return "Check their order, axes and focal length"
@@ -202,7 +202,7 @@ def _staged(picture: Picture, file: Path) -> CheckedView:
     return CheckedView(frames.intrinsics[0].double().numpy(), picture.pose, (pixels.shape[0], pixels.shape[1]))
 
 
-def fitting_shares(matches: Matches, views: dict[str, CheckedView]) -> dict[tuple[str, str], float]:
+def _fitting_shares(matches: Matches, views: dict[str, CheckedView]) -> dict[tuple[str, str], float]:
     """Returns the share of matches that fit the cameras, of every image's pair with most matches."""
     return {pair: float((off < _WITHIN).mean()) for pair, off in _distances(matches, views).items()}
 

@@ -73,7 +73,7 @@ def _key(name: str, parts: int, with_suffix: bool) -> str:
     return composed("/".join([*path.parts[:-1], short][-parts:]).lower())
 
 
-def named_camera(camera: ForeignCamera, name: str, size: tuple[int, int]) -> NamedCamera:
+def _named_camera(camera: ForeignCamera, name: str, size: tuple[int, int]) -> NamedCamera:
     """Returns a camera of an image of ``(height, width)`` as stored: that of its undistorted pinhole image.
 
     Raises:
@@ -106,7 +106,7 @@ def foreign_cameras(path: Path, files: Sequence[Path]) -> list[tuple[Path, Named
     """
     try:
         cameras = matched(read_photogrammetry(path), files)
-        return read_each(cameras, lambda file: (file, named_camera(cameras[file], file.name, image_size(file, ""))))
+        return read_each(cameras, lambda file: (file, _named_camera(cameras[file], file.name, image_size(file, ""))))
     except DataError:
         raise
     except FormatError as error:
@@ -128,5 +128,5 @@ def cameras_to_render(path: Path, files: Sequence[Path]) -> list[NamedCamera]:
         size = camera.size or (image_size(images[id(camera)], "") if id(camera) in images else None)
         if size is None:
             raise FormatError(f"{path} does not tell the size of {camera.name}: put its images next to it")
-        found.append(replace(named_camera(camera, camera.name or "view", size), photo=None))
+        found.append(replace(_named_camera(camera, camera.name or "view", size), photo=None))
     return found

@@ -19,7 +19,7 @@ from vg2gt.io.cameras_json import NamedCamera, Photo
 from vg2gt.monitor import Monitor
 from vg2gt.types import Cameras, Hints
 
-LONGER_SIDE = {"cuda": 518, "cpu": 280}  # pixels, by device; foundation models are trained at about 518
+_LONGER_SIDE = {"cuda": 518, "cpu": 280}  # pixels, by device; foundation models are trained at about 518
 PADDED = 1e-3
 """Mask of padding: hardly any weight, but unlike 0 it does not say that nothing is there (:func:`without_padding`)."""
 _FEWEST_POINTS = 20  # minimum observations of sparse points for a depth range
@@ -67,7 +67,7 @@ def working_size(
         raise ValueError(f"size {size} is smaller than one patch of {patch} pixels")
     shape = math.exp(sum(math.log(height / width) for height, width in sizes) / len(sizes))
     longest = sorted(max(pair) for pair in sizes)[len(sizes) // 2]
-    longer = max(size or min(LONGER_SIDE.get(device, LONGER_SIDE["cuda"]), longest), patch) // patch
+    longer = max(size or min(_LONGER_SIDE.get(device, _LONGER_SIDE["cuda"]), longest), patch) // patch
     shorter = max(1, round(longer * min(shape, 1 / shape)))
     return (longer * patch, shorter * patch) if shape > 1 else (shorter * patch, longer * patch)
 
@@ -90,7 +90,7 @@ def load_views(pictures: Sequence[Picture], size: tuple[int, int], monitor: Moni
         cameras = Cameras(given_poses(pictures, map_shift(pictures))[None], joined.intrinsics[None], size)
         depth = joined.depth[None] if all(picture.has_depth for picture in pictures) else None
         hints = Hints(depth, cameras, (source,), hints.frame_ids, depth_range(pictures), mask)
-    images = joined.images if joined.mask is None else cut_out(joined.images, joined.mask)
+    images = joined.images if joined.mask is None else _cut_out(joined.images, joined.mask)
     return Views(images, hints, joined.mask)
 
 
@@ -99,7 +99,7 @@ def without_padding(mask: Tensor) -> Tensor:
     return torch.where((mask - PADDED).abs() < PADDED / 2, 1.0, mask)
 
 
-def cut_out(images: Tensor, mask: Tensor) -> Tensor:
+def _cut_out(images: Tensor, mask: Tensor) -> Tensor:
     """Returns images ``[V, 3, H, W]`` in which masks ``[V, H, W]`` of objects hide what is around them.
 
     It becomes white, as transparent pixels are, or depth would be found there by what the masks hide. Other masks,

@@ -14,7 +14,7 @@ from vg2gt.geometry.cameras import crop_intrinsics
 from vg2gt.inputs.inputs import PADDED, working_size
 from vg2gt.inputs.pictures import Picture
 
-LEAST_KEPT = 0.8  # share of a picture's area; one that would lose more to cropping is padded
+_LEAST_KEPT = 0.8  # share of a picture's area; one that would lose more to cropping is padded
 
 
 def of_one_shape(
@@ -31,7 +31,7 @@ def padded(picture: Picture, shape: tuple[int, int]) -> Picture:
     Its ``whole`` is then the picture without padding.
     """
     ratio = picture.size[0] * shape[1] / (picture.size[1] * shape[0])
-    if min(ratio, 1 / ratio) >= LEAST_KEPT:
+    if min(ratio, 1 / ratio) >= _LEAST_KEPT:
         return picture
 
     def read(wanted: tuple[int, int]) -> Frames:

@@ -56,7 +56,7 @@ ImagesLike: TypeAlias = "str | Path | Image.Image | NDArray[Any] | Tensor | Sequ
 _OF_SEVERAL = (".tif", ".tiff", ".png", ".webp", ".avif")  # files of pages or animations; MPO's others are previews
 _ARCHIVES = (".7z", ".gz", ".rar", ".tar", ".tgz", ".zip")
 _HOLDS_PICTURES = (*PHOTO_SUFFIXES, R3D)
-VIDEO_FRAMES = 32  # frames taken from a video by default
+_VIDEO_FRAMES = 32  # frames taken from a video by default
 MOST_FRAMES = 1000  # frames taken from a video at most
 _FRAMES_LOOKED_AT = 5  # frames of a video that tell whether it is a panorama
 IN_MEMORY = 100  # maximum number of video frames kept in memory; with more, each is decoded on demand
@@ -184,7 +184,7 @@ def count_pictures(paths: Sequence[str], max_images: int | None = None) -> int:
             except ValueError:  # a recording of another layout
                 continue
         else:
-            count += VIDEO_FRAMES if path.suffix.lower() in VIDEO_SUFFIXES else 1
+            count += _VIDEO_FRAMES if path.suffix.lower() in VIDEO_SUFFIXES else 1
     return count if max_images is None else min(count, max_images)
 
 
@@ -265,7 +265,7 @@ def _pictures(item: Any, max_images: int | None, faults: dict[str, str]) -> list
             raise ValueError(f"{path} holds no images (rgbd/0.jpg and so on): is it a recording of Record3D?")
         return [_photo(file, read_recorded) for file in files.values()]
     if path.suffix.lower() in VIDEO_SUFFIXES:
-        return _unrolled(_video(path, max_images or VIDEO_FRAMES), path, max_images)
+        return _unrolled(_video(path, max_images or _VIDEO_FRAMES), path, max_images)
     return _photos([path], faults)
 
 

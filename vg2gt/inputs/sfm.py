@@ -52,15 +52,15 @@ log = logging.getLogger(__name__)
 
 FORMAT = 1
 """Version of the folder's format; increment it when the format changes."""
-IMAGE_SIDE = 1600  # maximum longer side of the kept images, in pixels
-LARGE_SIDE = 1200  # features of images from this longer side on are searched without doubling the images first
-FEATURE_SIDE, FEATURES = 1280, 4096  # longer side of doubled images before doubling, maximum number of features
-MANY_SIDE, MANY_FEATURES = 1024, 2048  # the same for more than ALL_PAIRS photographs
+_IMAGE_SIDE = 1600  # maximum longer side of the kept images, in pixels
+_LARGE_SIDE = 1200  # features of images from this longer side on are searched without doubling the images first
+_FEATURE_SIDE, _FEATURES = 1280, 4096  # longer side of doubled images before doubling, maximum number of features
+_MANY_SIDE, _MANY_FEATURES = 1024, 2048  # the same for more than ALL_PAIRS photographs
 ALL_PAIRS = 60  # number of photographs up to which all pairs are matched
 SEED = 0
 _MODEL = "SIMPLE_RADIAL"
 _QUALITY = 95  # JPEG quality of the kept images
-FEWEST_POINTS = 20  # minimum number of points of a sound model: a camera that only rotates yields none
+_FEWEST_POINTS = 20  # minimum number of points of a sound model: a camera that only rotates yields none
 _AT_ONCE = 4  # images per batch of feature extraction, to bound memory
 _PAIRS_AT_ONCE = 256  # pairs per call of the matcher, which indexes the features of every image in each call
 _LARGE_ERROR = 1.1  # pixels, mean reprojection error of photographs that a lens model does not fit
@@ -142,7 +142,7 @@ def find_cameras(pictures: Sequence[Picture], folder: Path, monitor: Monitor) ->
 def _key(pictures: Sequence[Picture]) -> str:
     """Returns a hash of the pictures' contents, masks, names and order, and of the processing settings."""
     features = feature_settings([max(picture.size) for picture in pictures])
-    settings = [FORMAT, IMAGE_SIDE, *features, SEED, _MODEL, _QUALITY]
+    settings = [FORMAT, _IMAGE_SIDE, *features, SEED, _MODEL, _QUALITY]
     contents = []
     for picture in pictures:
         mask = None if picture.path is None else mask_beside(picture.path)
@@ -228,9 +228,9 @@ def _stage(pictures: Sequence[Picture], work: Path, advance: Any) -> Lenses:
     masks: dict[str, NDArray[np.uint8]] = {}
     (work / "images").mkdir()
     for number, picture in enumerate(pictures):
-        shrink = min(1.0, IMAGE_SIDE / max(picture.size))
+        shrink = min(1.0, _IMAGE_SIDE / max(picture.size))
         target = (round(picture.size[0] * shrink), round(picture.size[1] * shrink))
-        frames = reduce_to_fit(picture.read(target), (IMAGE_SIDE, IMAGE_SIDE))
+        frames = reduce_to_fit(picture.read(target), (_IMAGE_SIDE, _IMAGE_SIDE))
         pixels = to_bytes(frames.images[0]).permute(1, 2, 0).numpy()
         name = f"{number:06d}.jpg"
         Image.fromarray(pixels).save(work / "images" / name, quality=_QUALITY, subsampling=0)
@@ -259,8 +259,8 @@ def feature_settings(sides: Sequence[int]) -> tuple[int, int, int]:
         Side, number, and first octave: -1 doubles images first, which small ones need to have enough features; 0 takes
         large ones as they are, in a third of the time.
     """
-    side, features = (FEATURE_SIDE, FEATURES) if len(sides) <= ALL_PAIRS else (MANY_SIDE, MANY_FEATURES)
-    return (IMAGE_SIDE, features, 0) if min(sides) >= LARGE_SIDE else (side, features, -1)
+    side, features = (_FEATURE_SIDE, _FEATURES) if len(sides) <= ALL_PAIRS else (_MANY_SIDE, _MANY_FEATURES)
+    return (_IMAGE_SIDE, features, 0) if min(sides) >= _LARGE_SIDE else (side, features, -1)
 
 
 def find_features(
@@ -362,7 +362,7 @@ def _map(work: Path, count: int, monitor: Monitor, centre: bool = False) -> list
             options=options,
             next_image_callback=lambda: advance() if next(expected, None) is not None else None,
         )
-    sound = [model for model in models.values() if model.num_points3D() >= FEWEST_POINTS]
+    sound = [model for model in models.values() if model.num_points3D() >= _FEWEST_POINTS]
     return sorted(sound, key=lambda model: (model.num_reg_images(), model.num_points3D()), reverse=True)
 
 

@@ -24,7 +24,7 @@ from vg2gt.io.errors import FormatError
 from vg2gt.io.files import read_json, write_json
 from vg2gt.types import Cameras
 
-MAX_SIZE = 1 << 16  # pixels along an image's side
+_MAX_SIZE = 1 << 16  # pixels along an image's side
 _ROTATION_TOLERANCE = 1e-3
 
 
@@ -204,7 +204,7 @@ class Fields:
 
     def pixels(self, name: str, required: bool = False) -> int | None:
         """Returns a whole number of pixels; None if it is missing and not ``required``."""
-        value = self.number(name, 0, MAX_SIZE)
+        value = self.number(name, 0, _MAX_SIZE)
         if (required and value is None) or (value is not None and value != round(value)):
             raise self.wrong(name, "a whole number of pixels")
         return None if value is None else round(value)

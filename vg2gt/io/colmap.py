@@ -36,7 +36,7 @@ PIXEL_CENTER = 0.5  # centre of the first pixel in COLMAP; ours is at 0
 FILES = ("cameras", "images", "points3D")
 _NOT_FINITE = re.compile(r"[\s-](nan|inf)\b", re.IGNORECASE)
 _FAR = 1e30  # larger values are as senseless as those that are not finite
-EXTRA = "pip install 'vg2gt[colmap]'"
+_EXTRA = "pip install 'vg2gt[colmap]'"
 
 
 def require_pycolmap(purpose: str, otherwise: str = "") -> None:
@@ -50,7 +50,7 @@ def require_pycolmap(purpose: str, otherwise: str = "") -> None:
         ImportError: if it is not installed; the message has the command that installs it.
     """
     if importlib.util.find_spec("pycolmap") is None:
-        remedy = f"{EXTRA}; {otherwise}" if otherwise else EXTRA
+        remedy = f"{_EXTRA}; {otherwise}" if otherwise else _EXTRA
         raise ImportError(f"{purpose} needs pycolmap: {remedy}")
 
 

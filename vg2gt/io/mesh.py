@@ -19,7 +19,7 @@ from vg2gt.geometry.normals import normals_from_depth
 from vg2gt.io.files import write_bytes
 from vg2gt.types import Cameras
 
-SUFFIXES = (".ply", ".glb")
+_SUFFIXES = (".ply", ".glb")
 MAX_VOXELS = 64_000_000  # bounds the memory at about 3 GB
 _TRUNCATION = 4  # distance from a surface at which free space begins, in voxels
 _BLOCK = 8  # voxels along a block's edge
@@ -109,8 +109,8 @@ def write_mesh(path: str | Path, mesh: Mesh) -> Path:
     import trimesh  # imported here, because it takes a second
 
     path = Path(path)
-    if path.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"{path}: a mesh is written as one of {', '.join(SUFFIXES)}")
+    if path.suffix.lower() not in _SUFFIXES:
+        raise ValueError(f"{path}: a mesh is written as one of {', '.join(_SUFFIXES)}")
     if not len(mesh.faces):
         raise ValueError("the mesh is empty: no valid depth, or voxels larger than the surfaces; check both")
     in_gltf = path.suffix.lower() == ".glb"

@@ -20,7 +20,7 @@ from vg2gt.io.cameras_json import Fields, check_rigid
 from vg2gt.io.files import read_json, write_json
 
 PIXEL_CENTER = 0.5  # centre of the first pixel in the file; ours is at 0
-DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 _ANY, _POSITIVE, _ANGLE = (-math.inf, math.inf), (0, math.inf), (0, math.pi)
 _LIMITS = {
@@ -171,7 +171,7 @@ def _read_lens(fields: Fields, shared: Lens) -> Lens:
     }
     if fields.content.get("is_fisheye") is True:  # instant-ngp's flag
         own["camera_model"] = "OPENCV_FISHEYE"
-    coefficients = {name: fields.number(name) for name in DISTORTION}
+    coefficients = {name: fields.number(name) for name in _DISTORTION}
     given = {name: value for name, value in coefficients.items() if value is not None}
     return replace(
         shared,

@@ -21,8 +21,8 @@ from vg2gt.io.files import regular, write_bytes
 from vg2gt.io.gaussian_arrays import OPACITY_MARGIN, GaussianArrays, to_arrays, to_gaussians
 from vg2gt.types import Gaussians
 
-FLATNESS = 0.01  # thickness of 2DGS Gaussians, which have none, relative to their smaller side
-FULL_REST = 45  # spherical harmonics up to degree 3 without the constant ones
+_FLATNESS = 0.01  # thickness of 2DGS Gaussians, which have none, relative to their smaller side
+_FULL_REST = 45  # spherical harmonics up to degree 3 without the constant ones
 _POSITION = ("x", "y", "z")
 _DC = tuple(f"f_dc_{i}" for i in range(3))
 _SCALE = tuple(f"scale_{i}" for i in range(3))
@@ -56,7 +56,7 @@ def write_gaussian_ply(path: str | Path, gaussians: Gaussians, *, extra: Mapping
     """
     arrays, extra = to_arrays(gaussians), extra or {}
     count, coefficients = arrays.sh.shape[:2]
-    rest = np.zeros((count, 3, FULL_REST // 3 if coefficients > 1 else 0))
+    rest = np.zeros((count, 3, _FULL_REST // 3 if coefficients > 1 else 0))
     rest[:, :, : coefficients - 1] = arrays.sh[:, 1:].transpose(0, 2, 1)
     rest = rest.reshape(count, rest.shape[1] * rest.shape[2])
     opacities = arrays.opacities.clip(OPACITY_MARGIN, 1 - OPACITY_MARGIN)
@@ -108,7 +108,7 @@ def read_gaussian_ply(path: str | Path) -> Gaussians:
         sides = _SCALE if _SCALE[2] in found or _SCALE[0] not in found else _SCALE[:2]
         scales = np.exp(_columns(path, table, sides))
         if len(sides) == 2:
-            scales = np.concatenate((scales, FLATNESS * scales.min(1, keepdims=True)), 1)
+            scales = np.concatenate((scales, _FLATNESS * scales.min(1, keepdims=True)), 1)
     means, quats = _columns(path, table, _POSITION), _columns(path, table, _ROTATION)
     gaussians = to_gaussians(path, GaussianArrays(means, quats, scales, opacities, sh))
     return replace(gaussians, background=_background(comments))

@@ -15,7 +15,7 @@ from vg2gt.geometry.cameras import project
 from vg2gt.io.mesh import Mesh, surface_of
 from vg2gt.types import Cameras
 
-MOST_VOXELS = 8_000_000
+_MOST_VOXELS = 8_000_000
 _TRUNCATION = 3.0  # voxels on either side of a surface in which views measure a distance
 _SMOOTH = 0.7  # standard deviation of the filter against steps, in voxels
 _MARGIN = 3  # empty voxels around the object
@@ -33,7 +33,7 @@ def fuse_solid(
         cameras: cameras of the V views (B = 1), of the maps' size.
         colors: ``[V, 3, H, W]`` in [0, 1].
         bounds: corners ``[3]`` of the object's box.
-        voxel_size: edge length of a voxel in scene units; larger if there were more than :data:`MOST_VOXELS`.
+        voxel_size: edge length of a voxel in scene units; larger if there were more than 8 million.
 
     Returns:
         The mesh of the largest part; empty if there is none.
@@ -55,7 +55,7 @@ def _grid(bounds: tuple[Tensor, Tensor], voxel_size: float) -> tuple[Tensor, tup
     """Returns the indices ``[N, 3]`` of the voxels of a box with a margin, their number per axis, and their size."""
     low, high = (corner.double() for corner in bounds)
     volume = float((high - low).clamp(min=voxel_size).prod())
-    voxel_size = max(voxel_size, (volume / MOST_VOXELS) ** (1 / 3))
+    voxel_size = max(voxel_size, (volume / _MOST_VOXELS) ** (1 / 3))
     first, last = (low / voxel_size).floor().long() - _MARGIN, (high / voxel_size).ceil().long() + _MARGIN
     axes = [torch.arange(int(a), int(b) + 1) for a, b in zip(first, last, strict=True)]
     index = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)

@@ -36,7 +36,7 @@ log = logging.getLogger(__name__)
 PACKAGES = Path(__file__).resolve().parents[2]
 SHARED = Path(__file__).with_name("compiled_math.py")
 """The only module outside their room (such as ``vg2gt/kernels``) that kernels may import from, as a test checks."""
-VARIABLE = "NUMBA_CACHE_DIR"
+_VARIABLE = "NUMBA_CACHE_DIR"
 
 config: Any = numba.config  # pyright: ignore[reportPrivateImportUsage]
 
@@ -152,7 +152,7 @@ def _folder(package: Path) -> Path | None:
     base = cache_folder()
     if base is None:
         log.warning(
-            "cannot cache compiled kernels, so every process recompiles them; set %s to a writable folder", VARIABLE
+            "cannot cache compiled kernels, so every process recompiles them; set %s to a writable folder", _VARIABLE
         )
         return None
     content = hashlib.sha256(f"{numba.__version__} {llvmlite.__version__} {platform.python_version()}".encode())
@@ -165,7 +165,7 @@ def _folder(package: Path) -> Path | None:
 
 def cache_folder() -> Path | None:
     """Returns the folder for compiled kernels and this machine's self-check results, or None if it is not writable."""
-    given = os.environ.get(VARIABLE)
+    given = os.environ.get(_VARIABLE)
     try:
         home = Path(given) if given else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         folder = home / "vg2gt" if given else home / "vg2gt" / "kernels"

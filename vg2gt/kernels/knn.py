@@ -14,12 +14,12 @@ from torch.nn import functional as F
 from vg2gt.kernels.curve_codes import z_codes
 from vg2gt.kernels.threads import compilable, parallel_for
 
-QUERIES_AT_ONCE = 256  # per thread, for k-d trees
-BITS = 19  # bits per axis of the finest cells, fewer if the key must hold many scenes
+_QUERIES_AT_ONCE = 256  # per thread, for k-d trees
+_BITS = 19  # bits per axis of the finest cells, fewer if the key must hold many scenes
 QUERIES = 1 << 17  # queries per chunk
 CANDIDATES = 1 << 23  # distances held at once, about 60 bytes each
 SHIFT = 0.37  # offset of the second curve, in extents: the two curves rarely jump at the same place
-SLACK = 1e-9  # relative margin for the rounding of distances
+_SLACK = 1e-9  # relative margin for the rounding of distances
 
 
 def nearest_in_scenes(
@@ -60,10 +60,10 @@ def _by_tree(queries: NDArray, tree: KDTree, count: int) -> Tensor:
     index = np.empty((len(queries), count), np.int64)
 
     def find(first: int) -> None:
-        part = slice(first, first + QUERIES_AT_ONCE)
+        part = slice(first, first + _QUERIES_AT_ONCE)
         index[part] = tree.query(queries[part], k=count)[1].reshape(-1, count)
 
-    parallel_for(range(0, len(queries), QUERIES_AT_ONCE), find)
+    parallel_for(range(0, len(queries), _QUERIES_AT_ONCE), find)
     return torch.from_numpy(index)
 
 
@@ -138,7 +138,7 @@ def nearest_by_cells(
     low = points.amin(0).double()
     extent = (points.amax(0).double() - low).amax().clamp(min=torch.finfo(torch.float32).tiny)
     points, queries = (points.double() - low) / extent, (queries.double() - low) / extent
-    bits = min(BITS, (62 - scenes.bit_length()) // 3)
+    bits = min(_BITS, (62 - scenes.bit_length()) // 3)
     curves = _Curves(points, point_batch, bits)
     first = torch.searchsorted(point_batch, torch.arange(scenes + 1, device=points.device))
     index = queries.new_zeros(len(queries), neighbors, dtype=torch.int64)
@@ -169,7 +169,7 @@ def _bound(queries: Tensor, batch: Tensor, curves: _Curves, first: Tensor, neigh
 
 def _search(queries: Tensor, batch: Tensor, radius: Tensor, curves: _Curves, index: Tensor, found: Tensor) -> None:
     """Writes the nearest points within the radius of each query into ``index`` and ``found``."""
-    starts, counts = _ranges(queries, batch, radius * (1 + SLACK) + SLACK / (1 << curves.bits), curves)
+    starts, counts = _ranges(queries, batch, radius * (1 + _SLACK) + _SLACK / (1 << curves.bits), curves)
     ends = counts.sum(1).cumsum(0)  # [N]
     total = int(ends[-1]) if len(ends) else 0
     bounds = [(0, 0), (len(queries), total)]
@@ -214,7 +214,7 @@ def _nearest(
     place = torch.arange(total, device=sizes.device) + (starts.flatten() - sizes.cumsum(0) + sizes)[owner]
     query = owner // starts.shape[1]
     squared = (queries[query] - curves.points[0][place]).square().sum(-1)
-    inside = (squared <= (radius * (1 + SLACK)).square()[query]).nonzero()[:, 0]
+    inside = (squared <= (radius * (1 + _SLACK)).square()[query]).nonzero()[:, 0]
     query, place, squared = query[inside], place[inside], squared[inside]
     order = torch.argsort(squared, stable=True)
     order = order[torch.argsort(query[order], stable=True)]

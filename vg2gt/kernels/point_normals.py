@@ -11,8 +11,8 @@ from torch import Tensor
 from vg2gt.kernels.compiled import kernel, kernel_part
 from vg2gt.kernels.threads import parallel_for
 
-PITCH, LINES = 256, 16  # a view's table: depth, truth and validity of three rows each, ray slopes, derivatives
-OWN, LEFT, RIGHT, ABOVE, BELOW = (PITCH * line for line in range(11, LINES))
+_PITCH, LINES = 256, 16  # a view's table: depth, truth and validity of three rows each, ray slopes, derivatives
+OWN, _LEFT, _RIGHT, _ABOVE, _BELOW = (_PITCH * line for line in range(11, LINES))
 ONE, ZERO = np.float32(1), np.float32(0)
 
 
@@ -31,7 +31,7 @@ class PointNormals(torch.autograd.Function):
         counts = [_count_corners(valid, stride) for stride in strides]
         weights = np.array([1 / (max(count, 1) * len(strides)) for count in counts])
         gradient, totals = np.zeros_like(maps[0]), np.zeros(len(maps[0]))
-        tables = np.zeros((len(totals), LINES * PITCH), gradient.dtype)
+        tables = np.zeros((len(totals), LINES * _PITCH), gradient.dtype)
         arrays = (*maps, *pinholes, turn.numpy(), np.array(strides), weights, tables, gradient, totals)
         parallel_for(range(len(totals)), lambda view: _disagreement(view, *arrays))
         ctx.gradient = torch.from_numpy(gradient)
@@ -61,7 +61,7 @@ def _count_corners(valid: Tensor, stride: int) -> int:
 def _disagreement(view, depth, true, valid, pinholes, true_pinholes, turn, strides, weights, tables, gradient, totals):
     """Adds one view's ``sum weight (1 - cos)`` over corners and strides to ``totals``, its derivative to ``gradient``.
 
-    Rows are processed in pieces, which are first copied into the view's row of ``tables`` ``[V, LINES PITCH]``. The
+    Rows are processed in pieces, which are first copied into the view's row of ``tables`` ``[V, LINES _PITCH]``. The
     compiler knows that the lines of a table do not overlap, so it vectorises. Invalid pixels are copied as depth one
     with validity zero.
     """
@@ -75,35 +75,35 @@ def _disagreement(view, depth, true, valid, pinholes, true_pinholes, turn, strid
         sums = 0.0
         for i in range(0, height, stride):
             v, w = (i - cy) / fy, (i - hy) / gy
-            for begin in range(0, width, stride * (PITCH - 2)):
-                columns = min((width - begin + stride - 1) // stride, PITCH - 2)
+            for begin in range(0, width, stride * (_PITCH - 2)):
+                columns = min((width - begin + stride - 1) // stride, _PITCH - 2)
                 for line in range(3):
                     row = i + (line - 1) * stride
                     inside = 0 <= row < height
                     for k in range(columns + 2):
                         j = begin + (k - 1) * stride
                         counts = inside and 0 <= j < width and valid[view, row, j]
-                        table[line * PITCH + k] = depth[view, row, j] if counts else ONE
-                        table[(3 + line) * PITCH + k] = true[view, row, j] if counts else ONE
-                        table[(6 + line) * PITCH + k] = ONE if counts else ZERO
+                        table[line * _PITCH + k] = depth[view, row, j] if counts else ONE
+                        table[(3 + line) * _PITCH + k] = true[view, row, j] if counts else ONE
+                        table[(6 + line) * _PITCH + k] = ONE if counts else ZERO
                 for k in range(columns + 2):
                     j = begin + (k - 1) * stride
-                    table[9 * PITCH + k] = (j - cx) / fx
-                    table[10 * PITCH + k] = (j - hx) / gx
+                    table[9 * _PITCH + k] = (j - cx) / fx
+                    table[10 * _PITCH + k] = (j - hx) / gx
                 sums += _row(table, columns, v, w, fx / stride, fy / stride, gx / stride, gy / stride, turn[view])
                 for k in range(1, columns + 1):
                     j = begin + (k - 1) * stride
                     gradient[view, i, j] += weight * table[OWN + k]
                     if k > 1 or begin > 0:
-                        gradient[view, i, j - stride] -= weight * table[LEFT + k]
+                        gradient[view, i, j - stride] -= weight * table[_LEFT + k]
                     if j + stride < width:
-                        gradient[view, i, j + stride] -= weight * table[RIGHT + k]
+                        gradient[view, i, j + stride] -= weight * table[_RIGHT + k]
                 if i >= stride:
                     for k in range(1, columns + 1):
-                        gradient[view, i - stride, begin + (k - 1) * stride] -= weight * table[ABOVE + k]
+                        gradient[view, i - stride, begin + (k - 1) * stride] -= weight * table[_ABOVE + k]
                 if i + stride < height:
                     for k in range(1, columns + 1):
-                        gradient[view, i + stride, begin + (k - 1) * stride] -= weight * table[BELOW + k]
+                        gradient[view, i + stride, begin + (k - 1) * stride] -= weight * table[_BELOW + k]
         totals[view] += weight * sums
 
 
@@ -115,18 +115,18 @@ def _row(table, columns, v, w, sx, sy, tx, ty, r):
     """
     total = ZERO
     for k in range(1, columns + 1):
-        u, q = table[9 * PITCH + k], table[10 * PITCH + k]
-        here, there = table[PITCH + k], table[4 * PITCH + k]
-        left, right, above, below = table[PITCH + k - 1], table[PITCH + k + 1], table[k], table[2 * PITCH + k]
+        u, q = table[9 * _PITCH + k], table[10 * _PITCH + k]
+        here, there = table[_PITCH + k], table[4 * _PITCH + k]
+        left, right, above, below = table[_PITCH + k - 1], table[_PITCH + k + 1], table[k], table[2 * _PITCH + k]
         x0, x1 = sx * (here - left) / left, sx * (right - here) / right
         y0, y1 = sy * (here - above) / above, sy * (below - here) / below
-        east, west = table[4 * PITCH + k + 1], table[4 * PITCH + k - 1]
-        north, south = table[3 * PITCH + k], table[5 * PITCH + k]
+        east, west = table[4 * _PITCH + k + 1], table[4 * _PITCH + k - 1]
+        north, south = table[3 * _PITCH + k], table[5 * _PITCH + k]
         ex0, ex1 = tx * (there - west) / west, tx * (east - there) / east
         ey0, ey1 = ty * (there - north) / north, ty * (south - there) / south
-        own = table[7 * PITCH + k]
-        m_left, m_right = own * table[7 * PITCH + k - 1], own * table[7 * PITCH + k + 1]
-        m_above, m_below = table[6 * PITCH + k], table[8 * PITCH + k]
+        own = table[7 * _PITCH + k]
+        m_left, m_right = own * table[7 * _PITCH + k - 1], own * table[7 * _PITCH + k + 1]
+        m_above, m_below = table[6 * _PITCH + k], table[8 * _PITCH + k]
         c0, ax0, ay0 = _turn_of_corner(x0, y0, ex0, ey0, u, v, q, w, r, m_left * m_above)
         c1, ax1, ay1 = _turn_of_corner(x1, y0, ex1, ey0, u, v, q, w, r, m_right * m_above)
         c2, ax2, ay2 = _turn_of_corner(x0, y1, ex0, ey1, u, v, q, w, r, m_left * m_below)
@@ -135,10 +135,10 @@ def _row(table, columns, v, w, sx, sy, tx, ty, r):
         of_left, of_right = -(ax0 + ax2) * sx / left, (ax1 + ax3) * sx / right
         of_above, of_below = -(ay0 + ay1) * sy / above, (ay2 + ay3) * sy / below
         table[OWN + k] = (of_left + of_right) + (of_above + of_below)
-        table[LEFT + k] = of_left * here / left
-        table[RIGHT + k] = of_right * here / right
-        table[ABOVE + k] = of_above * here / above
-        table[BELOW + k] = of_below * here / below
+        table[_LEFT + k] = of_left * here / left
+        table[_RIGHT + k] = of_right * here / right
+        table[_ABOVE + k] = of_above * here / above
+        table[_BELOW + k] = of_below * here / below
     return total
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from vg2gt.kernels.compiled import kernel
 from vg2gt.kernels.compiled_math import exp
 
-I1 = np.uintp(1)  # unsigned: no negative indices
+_I1 = np.uintp(1)  # unsigned: no negative indices
 
 
 @kernel(fastmath={"contract", "nsz", "arcp"}, error_model="numpy", nogil=True)
@@ -40,9 +40,9 @@ def spread_around(keys, columns, counts, spread, normal, offset, around, starts,
                 lowest = keys[voxel] + columns[column]
                 other = starts[column]
                 while keys[other] < lowest:
-                    other += I1
+                    other += _I1
                 starts[column] = other
-                column += I1
+                column += _I1
                 while keys[other] < lowest + 3:
                     x = offset[other, 0] + from_x
                     y = offset[other, 1] + from_y
@@ -59,7 +59,7 @@ def spread_around(keys, columns, counts, spread, normal, offset, around, starts,
                     yy += weight * (spread[other, 1, 1] + y * y)
                     yz += weight * (spread[other, 1, 2] + y * z)
                     zz += weight * (spread[other, 2, 2] + z * z)
-                    other += I1
+                    other += _I1
         share = one / total
         x, y, z = mean_x * share, mean_y * share, mean_z * share
         around[voxel, 0, 0] = xx * share - x * x

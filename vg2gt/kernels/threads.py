@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 Item = TypeVar("Item")
-VOXELS_AT_ONCE = 2048  # voxels per work item
+_VOXELS_AT_ONCE = 2048  # voxels per work item
 _Body = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
 
 
@@ -89,5 +89,5 @@ def compilable(*tensors: Tensor) -> bool:
 
 def over_voxels(voxels: int, run: Callable[[int, int], None]) -> None:
     """Calls ``run(first, last)`` for ranges that cover all voxels once and do not depend on the number of threads."""
-    firsts = range(0, voxels, VOXELS_AT_ONCE)
-    parallel_for(firsts, lambda first: run(first, min(first + VOXELS_AT_ONCE, voxels)))
+    firsts = range(0, voxels, _VOXELS_AT_ONCE)
+    parallel_for(firsts, lambda first: run(first, min(first + _VOXELS_AT_ONCE, voxels)))

@@ -19,10 +19,10 @@ from vg2gt.losses.strided import Neighbors, neighbor_pairs, pixel_squares
 from vg2gt.losses.truth import Truth
 from vg2gt.types import Cameras
 
-MAX_ERROR = 100.0
-SMALLEST_SQUARE = 1e-20  # keeps the square root's derivative finite
-QUANTILE_PIXELS = 1000
-DEPTH_STRIDES, POINT_STRIDES = (1, 2, 4, 8), (1, 2, 4)
+_MAX_ERROR = 100.0
+_SMALLEST_SQUARE = 1e-20  # keeps the square root's derivative finite
+_QUANTILE_PIXELS = 1000
+_DEPTH_STRIDES, _POINT_STRIDES = (1, 2, 4, 8), (1, 2, 4)
 MAPS = (-3, -2, -1)  # views, rows and columns
 
 
@@ -103,8 +103,8 @@ class GeometryLoss:
     def _value_terms(self, error: Tensor, conf: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
         keep = trusted_pixels(error, valid, self.quantile)
         count = keep.sum(MAPS).clamp(min=1)
-        weighted = (self.gamma * conf * error - self.alpha * conf.log()).clamp(max=MAX_ERROR)
-        return (weighted * keep).sum(MAPS) / count, (error.clamp(max=MAX_ERROR) * keep).sum(MAPS) / count
+        weighted = (self.gamma * conf * error - self.alpha * conf.log()).clamp(max=_MAX_ERROR)
+        return (weighted * keep).sum(MAPS) / count, (error.clamp(max=_MAX_ERROR) * keep).sum(MAPS) / count
 
 
 def trusted_pixels(error: Tensor, valid: Tensor, quantile: float) -> Tensor:
@@ -115,12 +115,12 @@ def trusted_pixels(error: Tensor, valid: Tensor, quantile: float) -> Tensor:
         valid: ``[V, H, W]`` bool with any of the leading axes; other pixels are never marked.
         quantile: share of the pixels.
     """
-    clamped = error.detach().clamp(max=MAX_ERROR)
+    clamped = error.detach().clamp(max=_MAX_ERROR)
     candidates = torch.where(valid, clamped, torch.inf).flatten(-3)
     count = valid.sum(MAPS)
     statistic = order_statistic if error.device.type == "cpu" else sorted_order_statistic
     limit = statistic(candidates, count.expand(error.shape[:-3]), quantile)
-    return valid & ((clamped <= limit[..., None, None, None]) | (count <= QUANTILE_PIXELS)[..., None, None, None])
+    return valid & ((clamped <= limit[..., None, None, None]) | (count <= _QUANTILE_PIXELS)[..., None, None, None])
 
 
 def order_statistic(values: Tensor, count: Tensor, quantile: float) -> Tensor:
@@ -143,11 +143,11 @@ def depth_gradient_loss(error: Tensor, valid: Tensor) -> Tensor:
         error: ``[..., V, H, W]``.
         valid: ``[V, H, W]`` bool with any of the leading axes.
     """
-    pairs = neighbor_pairs((error.shape[-2], error.shape[-1]), DEPTH_STRIDES, error.device)
+    pairs = neighbor_pairs((error.shape[-2], error.shape[-1]), _DEPTH_STRIDES, error.device)
     first, second = pairs.read(error).unbind(-2)  # [..., V, N]
     known, also = pairs.read(valid).unbind(-2)
-    differences = ((second - first).abs().clamp(max=MAX_ERROR) * (known & also)).sum(-2)
-    counts = [valid[..., ::stride, ::stride].sum(MAPS) for stride in DEPTH_STRIDES]
+    differences = ((second - first).abs().clamp(max=_MAX_ERROR) * (known & also)).sum(-2)
+    counts = [valid[..., ::stride, ::stride].sum(MAPS) for stride in _DEPTH_STRIDES]
     return (pairs.sums(differences) / torch.stack(counts, -1).clamp(min=1)).mean(-1)
 
 
@@ -167,7 +167,7 @@ def point_errors(depth: Tensor, cameras: Cameras, truth: Truth) -> Tensor:
     u, v = ray_slopes(cameras.intrinsics, size)
     x, y, z = true_points.unbind(-3)
     squared = (depth * u - x).square() + (depth * v - y).square() + (depth - z).square()
-    return squared.clamp(min=SMALLEST_SQUARE).sqrt()
+    return squared.clamp(min=_SMALLEST_SQUARE).sqrt()
 
 
 def point_normal_loss(depth: Tensor, cameras: Cameras, truth: Truth, valid: Tensor) -> Tensor:
@@ -188,14 +188,14 @@ def point_normal_loss(depth: Tensor, cameras: Cameras, truth: Truth, valid: Tens
         maps = (depth, truth.depth.expand_as(depth), valid.expand_as(depth))
         poses = (cameras.intrinsics, truth.cameras.intrinsics.expand_as(cameras.intrinsics), _turn(cameras, truth))
         scenes = zip(*(part.flatten(0, depth.dim() - 4) for part in (*maps, *poses)), strict=True)
-        losses: list[Tensor] = [PointNormals.apply(*scene, POINT_STRIDES) for scene in scenes]  # pyright: ignore
+        losses: list[Tensor] = [PointNormals.apply(*scene, _POINT_STRIDES) for scene in scenes]  # pyright: ignore
         return torch.stack(losses).view(depth.shape[:-3])
     return point_normal_reference(depth, cameras, truth, valid)
 
 
 def point_normal_reference(depth: Tensor, cameras: Cameras, truth: Truth, valid: Tensor) -> Tensor:
     """:func:`point_normal_loss` in plain torch, for any device; also differentiable in the cameras."""
-    squares = pixel_squares(cameras.size, POINT_STRIDES, depth.device)
+    squares = pixel_squares(cameras.size, _POINT_STRIDES, depth.device)
     predicted = _corner_normals(depth, cameras, squares)  # [..., B, V, 3, 2, 2, N]
     true = _corner_normals(truth.depth, truth.cameras, squares)
     true = (_turn(cameras, truth) @ true.flatten(-3)).view_as(predicted)

@@ -37,10 +37,10 @@ from vg2gt.types import Geometry, Tokens, VoxelMoments, Voxels
 
 log = logging.getLogger(__name__)
 
-EXTRA_CHANNELS = 8  # colour (3), position of the centroid in the cell (3), number of points (1), confidence (1)
-MOMENT_CHANNELS = 15  # spread (6), covariance with colour (9)
+_EXTRA_CHANNELS = 8  # colour (3), position of the centroid in the cell (3), number of points (1), confidence (1)
+_MOMENT_CHANNELS = 15  # spread (6), covariance with colour (9)
 # Scale inputs of the voxel network to about [-1, 1]; the spread of a uniformly filled cell is 1 / 12.
-SPREAD_SCALE, CROSS_SCALE = 12, 20
+_SPREAD_SCALE, _CROSS_SCALE = 12, 20
 
 
 class FineModule(nn.Module):
@@ -104,7 +104,7 @@ class FineModule(nn.Module):
         self.moments = moments
         self.normal_kernel = normal_kernel
         self.drop_fringes = drop_fringes
-        self.point_mlp = point_mlp(in_channels=width + EXTRA_CHANNELS + MOMENT_CHANNELS * moments)
+        self.point_mlp = point_mlp(in_channels=width + _EXTRA_CHANNELS + _MOMENT_CHANNELS * moments)
         self.out_channels = self.point_mlp.out_channels
 
     def voxel_edges(self, geometry: Geometry, coarsen: Tensor | None = None) -> Tensor:
@@ -184,7 +184,7 @@ class FineModule(nn.Module):
             if pooled.moments is not None:
                 moments = self._moments(pooled.moments, means, centroid, plan)
                 spread = [moments.spread[:, i, j] for i, j in zip(*UPPER, strict=True)]
-                extra += [SPREAD_SCALE * torch.stack(spread, -1), CROSS_SCALE * moments.cross.flatten(1)]
+                extra += [_SPREAD_SCALE * torch.stack(spread, -1), _CROSS_SCALE * moments.cross.flatten(1)]
         refined = self.point_mlp(torch.cat((pooled.features, *extra), -1), plan.grid, plan.batch, size)
         return Voxels(refined, colors, plan.grid, plan.batch, confidence, count, centroid, size, moments)
 

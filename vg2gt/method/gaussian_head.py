@@ -20,10 +20,10 @@ from vg2gt.types import Gaussians, Voxels, check_choice
 Anchor = Literal["centroid", "center"]
 Start = Literal["plain", "surfel"]
 MAX_SCALE = 2.0  # voxels; the paper's upper bound
-PLAIN_SCALE = 0.5  # voxels; initial scale of the plain start
+_PLAIN_SCALE = 0.5  # voxels; initial scale of the plain start
 MIN_SCALE = 1e-3  # voxels; renderers need a finite inverse
-INITIAL_ALPHA = 0.95  # initial joint opacity of a voxel's K Gaussians (plain start)
-SURFEL_ALPHA = 0.88  # initial opacity of each Gaussian (surfel start)
+_INITIAL_ALPHA = 0.95  # initial joint opacity of a voxel's K Gaussians (plain start)
+_SURFEL_ALPHA = 0.88  # initial opacity of each Gaussian (surfel start)
 
 
 class GaussianHead(nn.Module):
@@ -75,8 +75,8 @@ class GaussianHead(nn.Module):
         # small random weights: with zeros, the K splits would stay identical
         nn.init.normal_(self.out.weight, std=0.02)
         nn.init.zeros_(self.out.bias)
-        plain = 1 - (1 - INITIAL_ALPHA) ** (1 / splits)
-        alpha = plain if start == "plain" else SURFEL_ALPHA
+        plain = 1 - (1 - _INITIAL_ALPHA) ** (1 / splits)
+        alpha = plain if start == "plain" else _SURFEL_ALPHA
         self.opacity_bias = math.log(alpha / (1 - alpha))
         self.sh_gain: Tensor
         self.register_buffer("sh_gain", harmonic_gains(sh_degree), persistent=False)
@@ -105,7 +105,7 @@ class GaussianHead(nn.Module):
         # created on the device: a copy from the host would synchronise
         identity = torch.eye(4, dtype=rotation.dtype, device=rotation.device)[0]
         quats = F.normalize(rotation + identity, dim=-1)
-        start_scale, colors = scale.new_full((), PLAIN_SCALE), voxels.colors[:, None]
+        start_scale, colors = scale.new_full((), _PLAIN_SCALE), voxels.colors[:, None]
         # ours: the parameters are residuals to the surfel start
         if self.start == "surfel":
             start = self._surfels(voxels)

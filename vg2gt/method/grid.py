@@ -13,7 +13,7 @@ from torch.nn import functional as F
 from vg2gt.geometry.cameras import focal_lengths
 from vg2gt.types import Geometry
 
-MAX_CELLS = 1 << 18  # cells on either side of the origin: 19 bits per axis leave 6 of a code's 63 for the scene
+_MAX_CELLS = 1 << 18  # cells on either side of the origin: 19 bits per axis leave 6 of a code's 63 for the scene
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ def point_cells(points: Tensor, batch: Tensor, voxel_size: Tensor) -> Tensor:
 
 def in_range(cells: Tensor) -> Tensor:
     """Returns ``[N]`` bool: whether cells ``[N, 3]`` are finite and close enough to the origin to be indexed."""
-    return (cells.abs() < MAX_CELLS).all(-1)
+    return (cells.abs() < _MAX_CELLS).all(-1)
 
 
 def plan_voxels(cells: Tensor, batch: Tensor, valid: Tensor | None = None, valid_count: int | None = None) -> VoxelPlan:

@@ -11,7 +11,7 @@ from vg2gt.geometry.precision import Float32Linear
 from vg2gt.method.grid import scene_counts
 from vg2gt.method.serialization import Order, Windows, make_windows, relative_grid, serial_keys
 
-STAGE_ORDERS: tuple[Order, ...] = ("hilbert", "hilbert-trans", "z", "z-trans")
+_STAGE_ORDERS: tuple[Order, ...] = ("hilbert", "hilbert-trans", "z", "z-trans")
 
 
 class _ResidualPointBlock(nn.Module):
@@ -139,7 +139,7 @@ class PointMLP(nn.Module):
         return features
 
     def _windows(self, grid: Tensor, batch: Tensor, voxel_size: Tensor) -> list[Windows]:
-        orders = STAGE_ORDERS[: len(self.stages)]
+        orders = _STAGE_ORDERS[: len(self.stages)]
         *counts, last = torch.cat((scene_counts(batch, len(voxel_size)), grid.max()[None])).tolist()
         curves = [torch.argsort(key) for key in serial_keys(grid, batch, voxel_size, orders, extent=last + 1)]
         windows = [make_windows(counts, self.window, grid.device, shift) for shift in (0, self.window // 2)]

@@ -13,7 +13,7 @@ from vg2gt.kernels.curve_codes import hilbert_codes, z_codes
 
 Order = Literal["z", "z-trans", "hilbert", "hilbert-trans"]
 ORDERS: tuple[Order, ...] = get_args(Order)
-MAX_BITS = 21  # per axis; a code has three times as many bits of an int64
+_MAX_BITS = 21  # per axis; a code has three times as many bits of an int64
 
 
 def serial_codes(grid: Tensor, bits: int, orders: Sequence[Order]) -> list[Tensor]:
@@ -62,7 +62,7 @@ def serial_keys(
     """
     extent, scenes = int(grid.max()) + 1 if extent is None else extent, len(voxel_size)
     bits = max(min_bits, (extent - 1).bit_length())
-    if bits > MAX_BITS or 3 * bits + (scenes - 1).bit_length() > 63:
+    if bits > _MAX_BITS or 3 * bits + (scenes - 1).bit_length() > 63:
         sizes = ", ".join(f"{size:g}" for size in voxel_size.tolist())
         raise ValueError(
             f"a scene spans {extent} voxels along one axis (voxel size {sizes}, {scenes} scenes), too many for "

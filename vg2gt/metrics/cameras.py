@@ -8,9 +8,9 @@ from torch import Tensor
 from vg2gt.geometry.cameras import invert_rigid
 from vg2gt.types import Cameras
 
-ACCURACIES = (5, 15, 30)
-AREAS = (3, 5, 15, 30)
-STILL = 1e-6  # shorter baselines, relative to the distance from the world's origin, are float32 rounding
+_ACCURACIES = (5, 15, 30)
+_AREAS = (3, 5, 15, 30)
+_STILL = 1e-6  # shorter baselines, relative to the distance from the world's origin, are float32 rounding
 
 
 def relative_pose_errors(predicted: Cameras, reference: Cameras) -> tuple[Tensor, Tensor]:
@@ -33,7 +33,7 @@ def relative_pose_errors(predicted: Cameras, reference: Cameras) -> tuple[Tensor
         relative.append(pairs)
         # The difference of equal centres far from the origin is float32 rounding, which has a direction.
         distance = torch.maximum(poses[:, first, :3, 3].norm(dim=-1), poses[:, second, :3, 3].norm(dim=-1))
-        still.append(pairs[..., :3, 3].norm(dim=-1) <= STILL * distance)
+        still.append(pairs[..., :3, 3].norm(dim=-1) <= _STILL * distance)
     difference = relative[0][..., :3, :3].transpose(-1, -2) @ relative[1][..., :3, :3]
     axis = torch.stack([difference[..., i, j] - difference[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))], -1)
     trace = difference.diagonal(dim1=-2, dim2=-1).sum(-1)
@@ -59,8 +59,8 @@ def camera_metrics(predicted: Cameras, reference: Cameras) -> dict[str, float]:
         steps of one degree.
     """
     rotation, translation = relative_pose_errors(predicted, reference)
-    results = {f"rra_{t}": float((rotation < t).double().mean()) for t in ACCURACIES}
-    results |= {f"rta_{t}": float((translation < t).double().mean()) for t in ACCURACIES}
+    results = {f"rra_{t}": float((rotation < t).double().mean()) for t in _ACCURACIES}
+    results |= {f"rta_{t}": float((translation < t).double().mean()) for t in _ACCURACIES}
     worse = torch.maximum(rotation, translation).flatten()
-    degrees = torch.arange(1, max(AREAS) + 1, dtype=worse.dtype, device=worse.device)
-    return results | {f"auc_{t}": float((worse[:, None] < degrees[:t]).double().mean()) for t in AREAS}
+    degrees = torch.arange(1, max(_AREAS) + 1, dtype=worse.dtype, device=worse.device)
+    return results | {f"auc_{t}": float((worse[:, None] < degrees[:t]).double().mean()) for t in _AREAS}

@@ -12,13 +12,13 @@ from vg2gt.geometry.alignment import MIN_DEPTH, weighted_median
 from vg2gt.types import check_choice
 
 ALIGNMENTS = ("median", "scene", "wmed", "scale_shift", "none")
-DELTAS = (1.25, 1.05, 1.03)
-NAMES = ("abs_rel", "mae", "rmse", *(f"delta_{d}" for d in DELTAS), "coverage", *(f"delta_{d}_holes" for d in DELTAS))
+_DELTAS = (1.25, 1.05, 1.03)
+NAMES = ("abs_rel", "mae", "rmse", *(f"delta_{d}" for d in _DELTAS), "coverage", *(f"delta_{d}_holes" for d in _DELTAS))
 SMALLEST = 1e-6
-EDGE = 0.05  # relative step of depth between neighbouring pixels
+_EDGE = 0.05  # relative step of depth between neighbouring pixels
 
-NORMAL_ACCURACIES = (10, 30)  # degrees
-NORMAL_NAMES = ("mean", "median", *(f"acc_{a}" for a in NORMAL_ACCURACIES), "cosine")
+_NORMAL_ACCURACIES = (10, 30)  # degrees
+_NORMAL_NAMES = ("mean", "median", *(f"acc_{a}" for a in _NORMAL_ACCURACIES), "cosine")
 
 
 def depth_metrics(
@@ -83,7 +83,7 @@ def _score(predicted: Tensor, reference: Tensor, coverage: Tensor) -> dict[str, 
         "rmse": error.square().mean().sqrt(),
         "coverage": coverage,
     }
-    for delta in DELTAS:
+    for delta in _DELTAS:
         share = (ratio < delta).double().mean()
         results[f"delta_{delta}"] = share
         results[f"delta_{delta}_holes"] = share.nan_to_num(0.0) * coverage
@@ -111,10 +111,10 @@ def normal_metrics(predicted: Tensor, reference: Tensor, valid: Tensor) -> dict[
     angle = torch.atan2(torch.linalg.cross(predicted, reference, dim=1).norm(dim=1), dot).rad2deg()
     images = []
     for a, c in ((a[v], c[v]) for a, c, v in zip(angle, cosine, valid, strict=True) if v.any()):
-        shares = [(a < limit).double().mean() for limit in NORMAL_ACCURACIES]
+        shares = [(a < limit).double().mean() for limit in _NORMAL_ACCURACIES]
         images.append(torch.stack((a.mean(), a.median(), *shares, c.mean())))
-    means = torch.stack(images).mean(0).tolist() if images else [math.nan] * len(NORMAL_NAMES)
-    return dict(zip(NORMAL_NAMES, means, strict=True))
+    means = torch.stack(images).mean(0).tolist() if images else [math.nan] * len(_NORMAL_NAMES)
+    return dict(zip(_NORMAL_NAMES, means, strict=True))
 
 
 def near_depth_edges(depth: Tensor) -> Tensor:
@@ -127,7 +127,7 @@ def near_depth_edges(depth: Tensor) -> Tensor:
         count = depth.shape[axis] - 1
         first, second = depth.narrow(axis, 0, count), depth.narrow(axis, 1, count)
         nearer = torch.minimum(first, second)
-        broken = (nearer > 0) & ((first - second).abs() > EDGE * nearer)
+        broken = (nearer > 0) & ((first - second).abs() > _EDGE * nearer)
         edges.narrow(axis, 0, count).logical_or_(broken)
         edges.narrow(axis, 1, count).logical_or_(broken)
     flat = edges.to(torch.float32).flatten(0, -3)[:, None]  # [N, 1, H, W]

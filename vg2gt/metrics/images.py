@@ -13,18 +13,18 @@ from torch.nn import functional as F
 
 from vg2gt.io.tensors import read_tensors
 
-SSIM_WINDOW = 11  # kornia's Gaussian window has a standard deviation of 1.5 pixels
+_SSIM_WINDOW = 11  # kornia's Gaussian window has a standard deviation of 1.5 pixels
 
-WEIGHTS_URL = "https://download.pytorch.org/models/vgg16-397923af.pth"
-WEIGHTS_FILE = WEIGHTS_URL.rpartition("/")[2]
-HOW_TO_GET = "evaluation.lpips=download or evaluation.lpips=PATH"
+_WEIGHTS_URL = "https://download.pytorch.org/models/vgg16-397923af.pth"
+WEIGHTS_FILE = _WEIGHTS_URL.rpartition("/")[2]
+_HOW_TO_GET = "evaluation.lpips=download or evaluation.lpips=PATH"
 
 # Convolutions of each stage up to the activation that is compared; max pooling between the stages.
-STAGES = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
+_STAGES = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
 # Mean and standard deviation of ImageNet colours, for images in [-1, 1].
 SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)
-SMALLEST_IMAGE = 2 ** (len(STAGES) - 1)
+_SMALLEST_IMAGE = 2 ** (len(_STAGES) - 1)
 EPSILON = 1e-10
 
 
@@ -48,7 +48,7 @@ def ssim(predicted: Tensor, reference: Tensor) -> Tensor:
     """
     size = predicted.shape[-3:]
     first, second = (image.float().clamp(0, 1).reshape(-1, *size) for image in (predicted, reference))
-    values = kornia.metrics.ssim(first, second, SSIM_WINDOW, padding="valid")
+    values = kornia.metrics.ssim(first, second, _SSIM_WINDOW, padding="valid")
     return values.mean((-3, -2, -1)).reshape(predicted.shape[:-3])
 
 
@@ -75,7 +75,7 @@ class LPIPS(nn.Module):
         self.stages = nn.ModuleList()
         self.channel_weights = nn.ParameterList()
         channels, position = 3, 0
-        for stage, widths in enumerate(STAGES):
+        for stage, widths in enumerate(_STAGES):
             convolutions = nn.ModuleList()
             for width in widths:
                 convolution = nn.Conv2d(channels, width, 3, padding=1, device="meta")
@@ -98,9 +98,9 @@ class LPIPS(nn.Module):
         Raises:
             ValueError: if the shapes differ or the images are too small.
         """
-        if predicted.shape != reference.shape or min(predicted.shape[-2:]) < SMALLEST_IMAGE:
+        if predicted.shape != reference.shape or min(predicted.shape[-2:]) < _SMALLEST_IMAGE:
             raise ValueError(
-                f"LPIPS requires two images of the same shape [..., 3, H, W] with H, W >= {SMALLEST_IMAGE}, got "
+                f"LPIPS requires two images of the same shape [..., 3, H, W] with H, W >= {_SMALLEST_IMAGE}, got "
                 f"{tuple(predicted.shape)} and {tuple(reference.shape)}"
             )
         size = predicted.shape[-3:]
@@ -136,14 +136,14 @@ def load_lpips(source: str = "auto") -> LPIPS:
     if source == "download":
         try:
             features = torch.hub.load_state_dict_from_url(
-                WEIGHTS_URL, map_location="cpu", check_hash=True, weights_only=True
+                _WEIGHTS_URL, map_location="cpu", check_hash=True, weights_only=True
             )
         except OSError as error:  # urllib raises subclasses of it
-            raise WeightsNotFoundError(f"cannot download LPIPS weights from {WEIGHTS_URL}: {error}") from error
+            raise WeightsNotFoundError(f"cannot download LPIPS weights from {_WEIGHTS_URL}: {error}") from error
     else:
         path = Path(torch.hub.get_dir(), "checkpoints", WEIGHTS_FILE) if source == "auto" else Path(source).expanduser()
         if not path.is_file():
-            raise WeightsNotFoundError(f"LPIPS weights not found at {path}: {HOW_TO_GET}")
+            raise WeightsNotFoundError(f"LPIPS weights not found at {path}: {_HOW_TO_GET}")
         features = read_tensors(path)
     package = importlib.util.find_spec("torchmetrics")
     assert package is not None
@@ -155,5 +155,5 @@ def load_lpips(source: str = "auto") -> LPIPS:
 def _tensor(state: Mapping[str, Tensor], name: str, shape: tuple[int, ...]) -> Tensor:
     if name not in state or state[name].shape != shape:
         found = tuple(state[name].shape) if name in state else "missing"
-        raise ValueError(f"invalid LPIPS weights: {name} must have shape {shape}, got {found}; set {HOW_TO_GET}")
+        raise ValueError(f"invalid LPIPS weights: {name} must have shape {shape}, got {found}; set {_HOW_TO_GET}")
     return state[name].float()

@@ -55,7 +55,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 ROWS = 12  # maximum number of views in report.png
-MESH_PIXELS = 2.0  # edge of a mesh voxel, in pixels at the median depth
+_MESH_PIXELS = 2.0  # edge of a mesh voxel, in pixels at the median depth
 _LEAST_BYTES, _PHOTO_BYTES = 500_000, 300_000  # written per image: Gaussians and maps, an exported photograph
 _SAME = 1e-3  # largest difference of the poses of a scene that was made again, relative to their extent
 _MESH_DEPTHS = 10.0  # maximum depth of the mesh, in median depths
@@ -273,7 +273,7 @@ def _mesh_fusion(scene: Scene, paths: Sequence[Path], voxel_size: float | None) 
         status = [point_support(view.flatten(0, 1), scene.depth, scene.cameras.to("cpu"))[0] for view in points]
         depth = torch.where(torch.stack(status).view_as(depth) >= Status.SINGLE, depth, 0)
     focal = float(scene.cameras.intrinsics[..., [0, 1], [0, 1]].mean())
-    voxel_size = voxel_size or MESH_PIXELS * median / focal
+    voxel_size = voxel_size or _MESH_PIXELS * median / focal
     if scene.is_object:
         means = scene.gaussians.means.detach().cpu()
         bounds = (means.amin(0), means.amax(0))

@@ -22,7 +22,7 @@ from vg2gt.reconstruction.scene import Scene
 from vg2gt.rendering import Renderer
 from vg2gt.types import Cameras
 
-NEEDED, KNOWN = ("images", "depth", "depth_conf"), ("names", "mask", "error", "support")
+NEEDED, _KNOWN = ("images", "depth", "depth_conf"), ("names", "mask", "error", "support")
 
 
 def read_scene(folder: str | Path, renderer: Renderer, device: torch.device | str = "cpu") -> Scene:
@@ -98,7 +98,7 @@ def renderer_of(folder: Path, renderer: Renderer) -> Renderer:
 def _read_views(path: Path, named: list[NamedCamera], size: tuple[int, int]) -> dict[str, Any]:
     """Returns images, depth, confidence and, if saved, mask, error and support of the views."""
     try:
-        arrays = read_npz(path, NEEDED, KNOWN)
+        arrays = read_npz(path, NEEDED, _KNOWN)
         names = arrays.pop("names", None)
         if names is not None and names.tolist() != [view_stem(camera.name) for camera in named]:
             raise FormatError("it is of other images than cameras.json next to it")

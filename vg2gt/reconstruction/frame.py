@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 FAR = 1e4  # distance from the origin, in depths, at which float32 resolves about a thousandth of a depth
-SAME = 1e-4  # of the extent: cameras that differ less from the given ones are replaced by them
+_SAME = 1e-4  # of the extent: cameras that differ less from the given ones are replaced by them
 _LEVEL = 0.2  # minimum length of the cameras' mean down vector for it to define gravity
 
 
@@ -143,7 +143,7 @@ def moved_cameras(cameras: Cameras, move: Similarity, frame: SceneFrame) -> tupl
         given = torch.from_numpy(frame.poses @ frame.to_source)  # from the frame's world, not yet rigid
         given[:, :3] /= frame.scale
         extent = max(float(given[:, :3, 3].abs().max()), 1e-12)
-        if (given - poses).abs().max() < SAME * max(extent, 1.0):
+        if (given - poses).abs().max() < _SAME * max(extent, 1.0):
             poses = given
     moved = poses.to(cameras.world_to_camera.device, cameras.world_to_camera.dtype)
     return replace(cameras, world_to_camera=moved[None]), poses

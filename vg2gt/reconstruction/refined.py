@@ -34,9 +34,9 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-USABLE = 17.0  # dB; scenes below it look like fog
-WORKING_SHARE = 0.45  # of the time, at most, for the stage at the working size
-LARGER = 1.25  # factor from the working size to that of the photographs from which these are refined on their own
+_USABLE = 17.0  # dB; scenes below it look like fog
+_WORKING_SHARE = 0.45  # of the time, at most, for the stage at the working size
+_LARGER = 1.25  # factor from the working size to that of the photographs from which these are refined on their own
 
 
 def refine_scene(
@@ -64,7 +64,7 @@ def refine_scene(
     full = _of_full_size(scene, options)
     at_working_size = options
     if full is not None and options.seconds is not None:
-        at_working_size = replace(options, seconds=WORKING_SHARE * options.seconds)
+        at_working_size = replace(options, seconds=_WORKING_SHARE * options.seconds)
     fold = None if full is None else fold_of(split_views(seen, options.holdout)[0], full)
     with monitor.stage("refine", 100, " %") as advance:
         observe = _shown(advance, monitor)
@@ -97,7 +97,7 @@ def _of_full_size(scene: Scene, options: RefineOptions) -> FullSizeOptions | Non
     if options.full is None or not scene.pictures:
         return None
     size = full_size(scene.pictures, scene.cameras.size, options.full.size)
-    return options.full if max(size) >= LARGER * max(scene.cameras.size) else None
+    return options.full if max(size) >= _LARGER * max(scene.cameras.size) else None
 
 
 def refined_by_policy(
@@ -167,7 +167,7 @@ def _judged(psnr: float, views: int) -> str:
     """Says how good a scene is by the PSNR of views before they were trained, and what may be wrong if it is not."""
     which = "1 photograph that was" if views == 1 else f"{views} photographs that were"
     said = f"new views: PSNR of about {psnr:.1f} dB, measured on {which} left out at first"
-    if psnr >= USABLE:
+    if psnr >= _USABLE:
         return said
     return (
         f"{said}; this is hardly usable. Likely causes: the photographs are too far apart (take more, in smaller "

@@ -26,9 +26,9 @@ FEWEST = 2  # minimum number of views that agree with Gaussians to merge
 GROWTH = 2.0  # factor on merged standard deviations: neighbours overlap, and refinement has to add the detail
 OPACITY = 0.5  # of merged Gaussians
 COVERED = 0.5  # minimum accumulated opacity of a covered pixel
-NEIGHBOURS = 3  # of a point of structure from motion, whose mean distance is its size
-POINT = 0.5  # its opacity
-FILLED = 0.9  # opacity of a Gaussian in a hole: high enough to cover its block, low enough to be pruned if it is wrong
+_NEIGHBOURS = 3  # of a point of structure from motion, whose mean distance is its size
+_POINT = 0.5  # its opacity
+_FILLED = 0.9  # opacity of a Gaussian in a hole: high enough to cover its block, low enough to be pruned if it is wrong
 
 
 def supported(
@@ -138,14 +138,14 @@ def with_points(gaussians: Gaussians, points: Tensor, colors: Tensor) -> Gaussia
         points: ``[N, 3]`` positions.
         colors: ``[N, 3]`` in [0, 1].
     """
-    if len(points) <= NEIGHBOURS:
+    if len(points) <= _NEIGHBOURS:
         return gaussians
     positions = points.cpu().numpy()
-    gaps = torch.from_numpy(KDTree(positions).query(positions, NEIGHBOURS + 1)[0][:, 1:].mean(1)).to(points)
+    gaps = torch.from_numpy(KDTree(positions).query(positions, _NEIGHBOURS + 1)[0][:, 1:].mean(1)).to(points)
     nearest = torch.from_numpy(KDTree(gaussians.means.cpu().numpy()).query(positions)[0]).to(points)
     lonely = nearest > gaps
     size = gaps[lonely, None]
-    return gaussians.joined(_round(points[lonely], size, POINT, colors[lonely]))
+    return gaussians.joined(_round(points[lonely], size, _POINT, colors[lonely]))
 
 
 @torch.no_grad()
@@ -220,7 +220,7 @@ def _blocks(images: Tensor, hole: Tensor, depth: Tensor, camera: Cameras, pixels
     means = mean(unproject(depth[None], camera)[0].movedim(-1, 1))
     focal = camera.intrinsics[0, 0, [0, 1], [0, 1]].mean()
     size = ALONE * pixels * mean(depth[:, None]) / focal  # [N, 1]
-    return _round(means, size, FILLED, mean(images))
+    return _round(means, size, _FILLED, mean(images))
 
 
 def _round(means: Tensor, size: Tensor, opacity: float, colors: Tensor) -> Gaussians:

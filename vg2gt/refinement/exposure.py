@@ -11,9 +11,9 @@ from vg2gt.refinement.options import Observations, RefineRates
 from vg2gt.rendering import Renderer
 from vg2gt.types import Cameras, Gaussians
 
-DARKEST, BRIGHTEST = 0.05, 0.95  # pixels outside are clipped or noise
+_DARKEST, _BRIGHTEST = 0.05, 0.95  # pixels outside are clipped or noise
 COVERED = 0.5  # opacity of a pixel that shows a surface
-DIFFERENT = 0.1  # over the views, standard deviation: 0.02 to 0.06 on photographs, 0.3 with gains of 1/2 to 1.6
+_DIFFERENT = 0.1  # over the views, standard deviation: 0.02 to 0.06 on photographs, 0.3 with gains of 1/2 to 1.6
 RATE = 0.004
 
 
@@ -34,8 +34,8 @@ def log_exposures(gaussians: Gaussians, cameras: Cameras, seen: Observations, re
     for view in range(len(seen.images)):
         shown = plain(gaussians, cameras.select(slice(view, view + 1)))
         color, image = shown.color[0, 0], seen.images[view]
-        good = (shown.alpha[0, 0] > COVERED) & (torch.minimum(color, image).amin(0) > DARKEST)
-        good &= torch.maximum(color, image).amax(0) < BRIGHTEST
+        good = (shown.alpha[0, 0] > COVERED) & (torch.minimum(color, image).amin(0) > _DARKEST)
+        good &= torch.maximum(color, image).amax(0) < _BRIGHTEST
         if seen.mask is not None:
             good &= seen.mask[view] > COVERED
         ratio = (image[:, good].log() - color[:, good].log()).median(-1).values if good.any() else image.new_zeros(3)
@@ -50,5 +50,5 @@ def exposure_rates(
     if rates.exposure is not None:
         return rates
     found = log_exposures(gaussians, cameras, seen, renderer)
-    differ = len(found) > 1 and bool((found.std(0) > DIFFERENT).any())
+    differ = len(found) > 1 and bool((found.std(0) > _DIFFERENT).any())
     return replace(rates, exposure=RATE if differ else 0.0)

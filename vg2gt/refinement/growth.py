@@ -16,10 +16,10 @@ from vg2gt.types import Cameras, Gaussians
 
 MARGIN = 0.1  # of the image around it, within which a view counts as seeing a Gaussian
 REACH = 3.33  # standard deviations up to which a Gaussian is visible: exp(-REACH^2 / 2) = 1 / 255
-LOWPASS = 2.0  # pixels, more than the low-pass filter adds to this reach
-SHRINK, OFFSET = 0.62, 0.55  # of halves: their sum has nearly the shape of the whole, and overlaps by half
+_LOWPASS = 2.0  # pixels, more than the low-pass filter adds to this reach
+_SHRINK, _OFFSET = 0.62, 0.55  # of halves: their sum has nearly the shape of the whole, and overlaps by half
 UNSEEN = 1e-6  # contribution up to which a view does not show a Gaussian
-SURVEY = 280  # longer side in pixels of the renderings that measure contributions
+_SURVEY = 280  # longer side in pixels of the renderings that measure contributions
 
 
 def footprints(means: Tensor, cameras: Cameras, near: float) -> Tensor:
@@ -51,7 +51,7 @@ def in_front(scales: Tensor, means: Tensor, camera: Cameras, near: float) -> Ten
     """
     if compilable(scales, means, camera.intrinsics):
         height, width = camera.size
-        limits = (float(width), float(height), near, REACH, LOWPASS)
+        limits = (float(width), float(height), near, REACH, _LOWPASS)
         return rows_in_front(scales, means, camera.world_to_camera[0, 0], camera.intrinsics[0, 0], limits)
     return in_front_reference(scales, means, camera, near)
 
@@ -62,7 +62,7 @@ def in_front_reference(scales: Tensor, means: Tensor, camera: Cameras, near: flo
     pixels, depth = _projected(means, camera, 0, near)
     slant = ((pixels - camera.intrinsics[0, 0, :2, 2]) / camera.intrinsics[0, 0, [0, 1], [0, 1]]).square().sum(-1)
     focal = camera.intrinsics[0, 0, [0, 1], [0, 1]].max()
-    radius = (REACH * focal * sizes / depth.clamp(min=near) * (1 + slant).sqrt() + LOWPASS)[:, None]
+    radius = (REACH * focal * sizes / depth.clamp(min=near) * (1 + slant).sqrt() + _LOWPASS)[:, None]
     size = pixels.new_tensor(camera.size[::-1])
     seen = ((pixels > -radius) & (pixels < size + radius)).all(-1) & (depth > near)
     return seen.nonzero()[:, 0]
@@ -79,7 +79,7 @@ def contributions(gaussians: Gaussians, cameras: Cameras, renderer: Renderer) ->
         cameras: cameras of V views (B = 1).
         renderer: renderer of the scene.
     """
-    factor = min(1.0, SURVEY / max(cameras.size))
+    factor = min(1.0, _SURVEY / max(cameras.size))
     height, width = (max(1, round(side * factor)) for side in cameras.size)
     scale = cameras.intrinsics.new_tensor([width / cameras.size[1], height / cameras.size[0], 1])
     small = replace(cameras, intrinsics=cameras.intrinsics * scale[:, None], size=(height, width))
@@ -146,7 +146,7 @@ def split_large(parameters: Parameters, cameras: Cameras, near: float, pixels: f
     size = largest * footprints(parameters.values["means"], cameras, near)
     room = max(0, min(most - len(parameters), int((size > pixels).sum())))
     if room:
-        parameters.split(size.topk(room).indices.sort().values, SHRINK, OFFSET)
+        parameters.split(size.topk(room).indices.sort().values, _SHRINK, _OFFSET)
     return room
 
 

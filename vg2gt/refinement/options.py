@@ -17,9 +17,9 @@ from vg2gt.types import Cameras, Gaussians, Render, TensorRecord
 if TYPE_CHECKING:
     from vg2gt.refinement.parameters import RefinedScene
 
-RENDERINGS = 12  # of each view, if neither steps nor seconds are set
-MIN_ALPHA = 0.5
-MIN_CROP = 16  # pixels: SSIM needs its window
+_RENDERINGS = 12  # of each view, if neither steps nor seconds are set
+_MIN_ALPHA = 0.5
+_MIN_CROP = 16  # pixels: SSIM needs its window
 
 
 class Progress(NamedTuple):
@@ -128,7 +128,7 @@ class RefineLoss:
             terms["ssim"] = structure_loss(color, seen.images)
         if not self.needs_geometry:
             return terms
-        hits = (depth > 0) & (rendered.alpha[0] > MIN_ALPHA)
+        hits = (depth > 0) & (rendered.alpha[0] > _MIN_ALPHA)
         if self.depth_consistency:
             error = (torch.where(hits, depth, 0.0) - seen.depth).abs() / unit
             terms["depth_consistency"] = weighted_mean(error, seen.depth_conf, hits & (seen.depth > 0))
@@ -251,10 +251,10 @@ class FullSizeOptions:
 
     def __post_init__(self) -> None:
         for name, good, expected in (
-            ("size", self.size >= MIN_CROP, f"at least {MIN_CROP}"),
+            ("size", self.size >= _MIN_CROP, f"at least {_MIN_CROP}"),
             ("steps", self.steps >= 1, "at least 1"),
             ("renderings", self.renderings > 0, "positive"),
-            ("crop", self.crop >= MIN_CROP, f"at least {MIN_CROP}"),
+            ("crop", self.crop >= _MIN_CROP, f"at least {_MIN_CROP}"),
             ("coarse", 0 <= self.coarse < 1, "in [0, 1)"),
             ("rate", self.rate > 0, "positive"),
             ("max_gaussians", self.max_gaussians >= 1, "at least 1"),
@@ -338,7 +338,7 @@ class RefineOptions:
     def of(self, views: int) -> RefineOptions:
         """Returns the options for this number of trained views, with ``steps`` set if they have no end."""
         endless = self.steps is None and self.seconds is None
-        return replace(self, steps=RENDERINGS * views) if endless else self
+        return replace(self, steps=_RENDERINGS * views) if endless else self
 
     def done(self, step: int, seconds: float) -> float:
         """Returns the share of the refinement that is done after ``step`` steps and ``seconds``, at most 1."""

@@ -21,12 +21,12 @@ BETAS = (0.9, 0.99)
 EPSILON = 1e-8  # of Adam
 # rate of the higher spherical harmonics relative to that of the constant one: with 0.05, as in 3DGS, which takes a
 # hundred times as many steps, a set of photographs lost 0.4 dB; 0.5 lost 0.1 to 0.4 dB
-HIGHER_BANDS = 0.2
+_HIGHER_BANDS = 0.2
 # largest standard deviation in middle ones: longer Gaussians are strokes from where no photograph was taken
 LONGEST = 4.0
-LOGIT_MARGIN = 1e-4
-TRANSPARENT = 0.02  # opacity below which Gaussians are removed
-OF_GAUSSIANS = ("means", "quats", "scales", "opacities", "sh", "sh_rest")
+_LOGIT_MARGIN = 1e-4
+_TRANSPARENT = 0.02  # opacity below which Gaussians are removed
+_OF_GAUSSIANS = ("means", "quats", "scales", "opacities", "sh", "sh_rest")
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ class Parameters:
             "means": gaussians.means.clone(),
             "quats": F.normalize(gaussians.quats, dim=-1),
             "scales": gaussians.scales.log(),
-            "opacities": torch.logit(gaussians.opacities.clamp(LOGIT_MARGIN, 1 - LOGIT_MARGIN)),
+            "opacities": torch.logit(gaussians.opacities.clamp(_LOGIT_MARGIN, 1 - _LOGIT_MARGIN)),
             "sh": gaussians.sh[:, :1].clone(),
             "sh_rest": gaussians.sh[:, 1:].clone(),
             "cameras": gaussians.means.new_zeros(len(start.gain), 6),
@@ -117,7 +117,7 @@ class Parameters:
             "bias": start.bias.clone(),
         }
         exposure = rates.exposure or 0.0
-        self.rates = {**vars(rates), "sh_rest": HIGHER_BANDS * rates.sh, "gain": exposure, "bias": exposure}
+        self.rates = {**vars(rates), "sh_rest": _HIGHER_BANDS * rates.sh, "gain": exposure, "bias": exposure}
         self.moments = {name: (torch.zeros_like(value), torch.zeros_like(value)) for name, value in self.values.items()}
         self.counts = torch.zeros_like(self.unit)
         self.steps = 0
@@ -132,7 +132,7 @@ class Parameters:
         self._rows = rows
         self._leaves = values = {
             name: (
-                value.clone() if rows is None or name not in OF_GAUSSIANS else value.index_select(0, rows)
+                value.clone() if rows is None or name not in _OF_GAUSSIANS else value.index_select(0, rows)
             ).requires_grad_(bool(self.rates[name]))
             for name, value in self.values.items()
         }
@@ -201,7 +201,7 @@ class Parameters:
             if rate := share * self.rates[name]:
                 value, moments = self.values[name], self.moments[name]
                 unit = self.unit if name == "means" else value.new_ones(len(value))
-                which = of_gaussians if name in OF_GAUSSIANS else of_views
+                which = of_gaussians if name in _OF_GAUSSIANS else of_views
                 update_rows(RowUpdate(value, moments, grad, *which, unit, BETAS, EPSILON, rate))
         scales = self.values["scales"][rows]
         longest = scales.median(-1, keepdim=True).values + math.log(LONGEST)
@@ -211,7 +211,7 @@ class Parameters:
     @torch.no_grad()
     def prune(self) -> None:
         """Removes transparent Gaussians, unless all are."""
-        keep = torch.sigmoid(self.values["opacities"]) >= TRANSPARENT
+        keep = torch.sigmoid(self.values["opacities"]) >= _TRANSPARENT
         if not keep.all() and keep.any():
             self.keep(keep)
 
@@ -253,8 +253,8 @@ class Parameters:
         """Applies a change of rows to all that is known of the Gaussians."""
         known = (self.unit, self.size, self.seen, self.least, self.counts)
         unit, size, seen, least, counts = map(change, known)
-        values = self.values | {name: change(self.values[name]) for name in OF_GAUSSIANS}
-        moments = self.moments | {name: _both(change, self.moments[name]) for name in OF_GAUSSIANS}
+        values = self.values | {name: change(self.values[name]) for name in _OF_GAUSSIANS}
+        moments = self.moments | {name: _both(change, self.moments[name]) for name in _OF_GAUSSIANS}
         # at once, because Ctrl-C during the copies must leave a scene that fits together
         self.unit, self.size, self.seen, self.least, self.counts = unit, size, seen, least, counts
         self.values, self.moments = values, moments

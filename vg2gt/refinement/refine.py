@@ -24,11 +24,11 @@ from vg2gt.types import Cameras, Gaussians
 
 log = logging.getLogger(__name__)
 
-WORSE = 2.0  # loss of left-out views, relative to the start and to the best state, that counts as divergence
+_WORSE = 2.0  # loss of left-out views, relative to the start and to the best state, that counts as divergence
 FINAL_RATE = 0.1  # factor to which rates decay exponentially
-MAX_GROWTH = 1.5  # maximum number of Gaussians after filling holes, as a multiple of the initial number
+_MAX_GROWTH = 1.5  # maximum number of Gaussians after filling holes, as a multiple of the initial number
 FEWEST = 4  # with fewer views, none is left out
-LEFT_OUT = 8  # one view in this many is left out at a time
+_LEFT_OUT = 8  # one view in this many is left out at a time
 SMOOTH = 3  # number of checks to average, since each scores other views
 
 
@@ -82,7 +82,7 @@ def sharpened(
     scene = replace(sharp.scene, cameras=poses)
     if options.rates.cameras:
         scene = scene.seen_from(refined.scene.cameras.world_to_camera[0, 0])
-    _, after = view_losses(scene, seen, sharp.renderer, options.loss.with_geometry(0), torch.arange(len(seen.images)))
+    _, after = _view_losses(scene, seen, sharp.renderer, options.loss.with_geometry(0), torch.arange(len(seen.images)))
     return replace(
         refined,
         scene=scene,
@@ -98,15 +98,15 @@ def sharpened(
 
 
 @torch.no_grad()
-def view_losses(
+def _view_losses(
     scene: RefinedScene, seen: Observations, renderer: Renderer, loss: RefineLoss, views: Tensor, unit: float = 1.0
 ) -> tuple[Tensor, Tensor]:
     """Returns loss and PSNR ``[R]`` of views ``[R]``, each rendered on its own, on the CPU."""
-    found = [view_loss(scene, seen, renderer, loss, view, unit) for view in views.to(seen.images.device).split(1)]
+    found = [_view_loss(scene, seen, renderer, loss, view, unit) for view in views.to(seen.images.device).split(1)]
     return torch.stack([each for each, _ in found]).cpu(), torch.cat([image for _, image in found]).cpu()
 
 
-def view_loss(
+def _view_loss(
     scene: RefinedScene, seen: Observations, renderer: Renderer, loss: RefineLoss, views: Tensor, unit: float
 ) -> tuple[Tensor, Tensor]:
     """Returns the loss of some views, and their PSNR ``[R]``; ``unit``: median depth of the scene."""
@@ -204,7 +204,7 @@ class _Refinement:
         if points is not None:
             begun = replace(begun, gaussians=with_points(begun.gaussians, *points))
         if options.fill:
-            room = int(MAX_GROWTH * len(start)) - len(start)
+            room = int(_MAX_GROWTH * len(start)) - len(start)
             filled = fill_holes(begun.gaussians, cameras, seen, renderer, self.trained, options.fill, room)
             begun = replace(begun, gaussians=filled)
         self.parameters = Parameters(begun, options.rates, self.pixel, self.depth, self.trained)
@@ -253,7 +253,7 @@ class _Refinement:
         every = self.options.geometry_every
         of_step = self.options.loss.with_geometry(0 if self.steps % every else every)
         view = self.order.deal().to(self.seen.images.device)
-        loss, images = view_loss(scene, self.seen, self.renderer, of_step, view, self.depth)
+        loss, images = _view_loss(scene, self.seen, self.renderer, of_step, view, self.depth)
         if terms := of_step.of_gaussians(scene.gaussians, self.parameters.size, self.parameters.seen):
             loss = loss + of_step.total(terms)
         self.recent.append(float(images.mean()))
@@ -273,7 +273,7 @@ class _Refinement:
 
     def _score(self, scene: RefinedScene, views: Tensor) -> tuple[Tensor, Tensor]:
         """Returns loss and PSNR ``[R]`` of views, each rendered on its own."""
-        return view_losses(scene, self.seen, self.renderer, self.scoring, views, self.depth)
+        return _view_losses(scene, self.seen, self.renderer, self.scoring, views, self.depth)
 
     def _check(self) -> str:
         """Scores the current state and keeps it if it is the best; returns what is wrong if it diverges."""
@@ -283,9 +283,9 @@ class _Refinement:
         score = float((loss / self.start_loss[views]).mean())
         if not math.isfinite(score):
             return "the loss is not finite"
-        if score > WORSE:
+        if score > _WORSE:
             best, _ = self._score(self.best, views)
-            if score > WORSE * float((best / self.start_loss[views]).mean()):
+            if score > _WORSE * float((best / self.start_loss[views]).mean()):
                 return f"the loss of the left-out views is {score:.1f} times the initial one"
         self.scores = [*self.scores, score][-SMOOTH:]
         smooth = sum(self.scores) / len(self.scores)
@@ -351,4 +351,4 @@ class ViewOrder:
                 yield self.trained[:0]
         order = self.trained[torch.randperm(len(self.trained), generator=self._generator)]
         while True:
-            yield from order.split(-(-len(order) // LEFT_OUT))
+            yield from order.split(-(-len(order) // _LEFT_OUT))

@@ -24,12 +24,12 @@ log = logging.getLogger(__name__)
 
 FINAL_RATE = 0.1  # factor to which rates decay exponentially
 FEWEST = 6  # with fewer views, none is left out
-SCORED = 3  # maximum number of left-out views
+_SCORED = 3  # maximum number of left-out views
 APART = 20  # minimum number of steps between two checks
 CHECKS = 8  # number of times that left-out views are scored
 SMOOTH = 3  # number of checks to average: a single view varies by half a dB from check to check
-NOTICED = 0.7  # dB below the best average at which the stage becomes shorter; at 0.1, a set lost 0.3 dB by chance
-REJECTED = 1.5  # dB below the start at which the stage is given up; at 0.1, a set lost 2.5 dB by chance
+_NOTICED = 0.7  # dB below the best average at which the stage becomes shorter; at 0.1, a set lost 0.3 dB by chance
+_REJECTED = 1.5  # dB below the start at which the stage is given up; at 0.1, a set lost 2.5 dB by chance
 # size of the photographs, in working sizes, from which the stage begins at half of it and compensates opacities
 LARGE = 2.5
 
@@ -271,8 +271,8 @@ class _Sharpening:
             self.checked = self.steps
         smooth = [sum(self.scores[:n][-SMOOTH:]) / min(n, SMOOTH) for n in range(1, len(self.scores) + 1)]
         fall = max(smooth) - smooth[-1] if len(smooth) > SMOOTH else 0.0
-        worse = fall > NOTICED
-        if fall > REJECTED and smooth[0] == max(smooth):
+        worse = fall > _NOTICED
+        if fall > _REJECTED and smooth[0] == max(smooth):
             return "no gain"
         if worse:
             self.stretch = self._raw() / self.full.opened
@@ -303,7 +303,7 @@ def fold_of(views: Tensor, options: FullSizeOptions) -> Tensor:
     """Returns the views of ``views [N]`` that are left out at first: one of several, but no more than three."""
     if not options.fold or len(views) < FEWEST:
         return views[:0]
-    count = min(SCORED, max(1, len(views) // options.fold))
+    count = min(_SCORED, max(1, len(views) // options.fold))
     places = (torch.arange(count, dtype=torch.float64) + 0.5) * len(views) / count
     return views[places.long()]
 

@@ -28,9 +28,9 @@ from vg2gt.rendering.options import RenderOptions
 from vg2gt.rendering.scenes import Images, SceneViews
 from vg2gt.types import Footprints
 
-TILES_PER_ITEM = 8
+_TILES_PER_ITEM = 8
 HIT_CAPACITY = 128  # hits per ray for the depth solver, even; a tile with more gets a larger buffer
-CACHE_LINE = 64  # bytes
+_CACHE_LINE = 64  # bytes
 
 _local = threading.local()
 
@@ -79,8 +79,8 @@ class _View:
 
     @property
     def tile_ranges(self) -> list[tuple[int, int]]:  # first and last tile (exclusive) of every work item
-        starts = range(0, self.tiles, TILES_PER_ITEM)
-        return [(start, min(start + TILES_PER_ITEM, self.tiles)) for start in starts]
+        starts = range(0, self.tiles, _TILES_PER_ITEM)
+        return [(start, min(start + _TILES_PER_ITEM, self.tiles)) for start in starts]
 
     @property
     def blocks(self) -> range:  # of Gaussians
@@ -228,8 +228,8 @@ def _scratch(dtype: np.dtype) -> SimpleNamespace:
 
 def _aligned(count: int, dtype: np.dtype) -> np.ndarray:
     """Allocates an array that begins at a cache line, so that no vector operation on a block of rays touches two."""
-    memory = np.empty(count * dtype.itemsize + CACHE_LINE, np.uint8)
-    start = -memory.ctypes.data % CACHE_LINE
+    memory = np.empty(count * dtype.itemsize + _CACHE_LINE, np.uint8)
+    start = -memory.ctypes.data % _CACHE_LINE
     return memory[start : start + count * dtype.itemsize].view(dtype)
 
 

@@ -16,7 +16,7 @@ from vg2gt.rendering.projection import Splats, respond, visible_splats
 from vg2gt.rendering.scenes import Images, SceneViews
 from vg2gt.types import Footprints
 
-CELLS_PER_CHUNK = 1 << 21  # pixels times Gaussians held at once
+_CELLS_PER_CHUNK = 1 << 21  # pixels times Gaussians held at once
 
 
 def rasterize_dense(scene: SceneViews, options: RenderOptions) -> Images:
@@ -32,7 +32,7 @@ def _render_view(scene: SceneViews, options: RenderOptions) -> Images:
     if scene.footprints is not None:
         splats = _with_footprints(splats, index, scene.footprints)
     pixels = pixel_grid(height, width, like=scene.means).reshape(-1, 2)  # [H * W, 2]
-    chunks = pixels.split(max(1, CELLS_PER_CHUNK // max(1, len(splats.depth))))
+    chunks = pixels.split(max(1, _CELLS_PER_CHUNK // max(1, len(splats.depth))))
     parts = [
         _render_pixels(_noting(splats, index, len(chunk), scene.footprints), chunk, scene.background, options)
         for chunk in chunks

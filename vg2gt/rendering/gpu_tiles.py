@@ -30,9 +30,9 @@ from vg2gt.types import Cameras, Footprints, Gaussians, Render
 
 kernels: Any = launchable  # Triton kernels are launched as kernel[grid](...), which type checkers do not know
 
-ROW_SHARE = 64  # gradient rows take 1 / ROW_SHARE of a GPU's memory
+_ROW_SHARE = 64  # gradient rows take 1 / _ROW_SHARE of a GPU's memory
 ROWS = 3_000_000  # gradient rows held at once without a GPU
-SLOT_SHARE, SLOT_BYTES = 8, 256  # slots rendered at once take 1 / SLOT_SHARE; bytes per slot, with its entries
+_SLOT_SHARE, _SLOT_BYTES = 8, 256  # slots rendered at once take 1 / _SLOT_SHARE; bytes per slot, with its entries
 
 
 class RefusedError(ValueError):
@@ -65,7 +65,7 @@ def render_triton(
     tensors = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
     tensors = (*tensors, cameras.world_to_camera, cameras.intrinsics, background)
     with torch.cuda.device_of(gaussians.means):  # Triton launches on the current device
-        slots = _at_once(gaussians.means.device, SLOTS, SLOT_SHARE * SLOT_BYTES)
+        slots = _at_once(gaussians.means.device, SLOTS, _SLOT_SHARE * _SLOT_BYTES)
         some = max(1, slots // max(1, len(gaussians)))
         parts = []
         for number, (poses, intrinsics) in enumerate(
@@ -109,7 +109,7 @@ class _Render(torch.autograd.Function):
         (height, width), options, rows, footprints = inputs[10:]
         poses, background = tensors[5], tensors[7]
         scenes, views = poses.shape[:2]
-        rows = rows or _at_once(poses.device, ROWS, ROW_SHARE * 4 * RECORD)
+        rows = rows or _at_once(poses.device, ROWS, _ROW_SHARE * 4 * RECORD)
         lists = _list(tensors, (height, width), options, rows)
         solid = options.mode == "solid"
         if footprints is not None:

@@ -17,7 +17,7 @@ from torch import Tensor
 from vg2gt.rendering.constants import BRACKET_SIGMAS, MEDIAN_MAX_TRANSMITTANCE
 from vg2gt.rendering.options import RenderOptions
 
-LOG_HALF = math.log(0.5)
+_LOG_HALF = math.log(0.5)
 
 
 def log_transmittance(t: Tensor, alpha: Tensor, peak: Tensor, precision: Tensor) -> Tensor:
@@ -46,7 +46,7 @@ class MedianDepth(torch.autograd.Function):
         """
 
         def residual(t: Tensor) -> Tensor:
-            return log_transmittance(t[:, None], alpha, peak, precision).sum(-1) - LOG_HALF
+            return log_transmittance(t[:, None], alpha, peak, precision).sum(-1) - _LOG_HALF
 
         reach = BRACKET_SIGMAS / precision.sqrt()
         hit = alpha > 0

@@ -28,7 +28,7 @@ from vg2gt.types import Cameras, Gaussians
 VALUES = 5e-5  # largest allowed error of an image; float32 rounding gives about 2e-6
 GRADIENTS = 5e-4  # largest allowed error of a gradient, relative to its norm; float32 rounding: about 1e-6
 MODES: tuple[Mode, ...] = ("solid", "rasterized")
-SCENES, COUNT, SIZE, VIEWS, DEGREE = 2, 7, (9, 11), 2, 2  # COUNT: Gaussians per scene; DEGREE: as in model=vg2gt
+SCENES, COUNT, SIZE, VIEWS, _DEGREE = 2, 7, (9, 11), 2, 2  # COUNT: Gaussians per scene; _DEGREE: as in model=vg2gt
 STREAM = 44  # seed of the scenes, with which three quarters of the rays have a well-conditioned depth
 ROWS = 8  # gradient rows held at once: fewer than a view has, so that views are processed one by one
 SOURCES = [path for files in ("gpu/*.py", "*.py") for path in sorted(Path(__file__).parent.glob(files))]
@@ -168,7 +168,7 @@ def _fixed_scene() -> tuple[Tensor, ...]:
         _numbers(4 * total, STREAM + 3).view(total, 4) + torch.tensor([0.2, 0, 0, 0], dtype=torch.float64),
         0.35 * torch.exp(0.7 * _numbers(3 * total, STREAM + 4)).view(total, 3),
         (0.8 + 0.6 * _numbers(total, STREAM + 5)).clamp(max=1.0),
-        0.6 * _numbers(total * (DEGREE + 1) ** 2 * 3, STREAM + 6).view(total, -1, 3),
+        0.6 * _numbers(total * (_DEGREE + 1) ** 2 * 3, STREAM + 6).view(total, -1, 3),
         poses,
         focal.repeat(SCENES, VIEWS, 1, 1),
         torch.tensor([0.3, 0.1, 0.7], dtype=torch.float64),

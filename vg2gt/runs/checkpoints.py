@@ -18,9 +18,9 @@ from vg2gt.io.files import replacing, write_bytes
 
 log = logging.getLogger(__name__)
 
-PATTERN = "step-*.ckpt"
-DAMAGED = "is damaged or not a checkpoint of this project (delete it to resume from the one before)"
-SLIM = ".safetensors"  # a checkpoint without training state
+_PATTERN = "step-*.ckpt"
+_DAMAGED = "is damaged or not a checkpoint of this project (delete it to resume from the one before)"
+_SLIM = ".safetensors"  # a checkpoint without training state
 MADE_OF = "config"  # key of the configuration of backend, model and renderer, as YAML
 MODEL_PREFIX = "model."  # prefix of the model's names in a checkpoint's state_dict, from the Lightning module
 
@@ -51,7 +51,7 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"no checkpoint at {path}")
-    if path.suffix == SLIM:
+    if path.suffix == _SLIM:
         return _read_slim(path)
     try:
         with zipfile.ZipFile(path) as archive:  # torch.load does not verify checksums: flipped bits become weights
@@ -61,7 +61,7 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
         if not isinstance(content, dict):
             raise ValueError(f"it holds a {type(content).__name__}")
     except Exception as error:  # damaged bytes make readers raise almost anything
-        raise ValueError(f"{path} {DAMAGED}: {error}") from error
+        raise ValueError(f"{path} {_DAMAGED}: {error}") from error
     return content
 
 
@@ -80,8 +80,8 @@ def write_slim(checkpoint: str | Path, path: str | Path) -> Path:
         ValueError: if ``path`` has another suffix, or the checkpoint holds no configuration.
     """
     content = read_checkpoint(checkpoint)
-    if Path(path).suffix != SLIM or MADE_OF not in content:
-        raise ValueError(f"{path} must end with {SLIM}, and {checkpoint} must contain its configuration")
+    if Path(path).suffix != _SLIM or MADE_OF not in content:
+        raise ValueError(f"{path} must end with {_SLIM}, and {checkpoint} must contain its configuration")
     header = {
         "backend": json.dumps(content["backend"]),
         "step": str(content["global_step"]),
@@ -103,7 +103,7 @@ def _read_slim(path: Path) -> dict[str, Any]:
             MADE_OF: header[MADE_OF],
         }
     except (SafetensorError, OSError, KeyError, ValueError) as error:
-        raise ValueError(f"{path} {DAMAGED}: {error}") from error
+        raise ValueError(f"{path} {_DAMAGED}: {error}") from error
     return {"state_dict": state, **facts}
 
 
@@ -133,7 +133,7 @@ def newest(folder: str | Path) -> Path:
 
 def by_age(folder: Path) -> list[Path]:
     """Returns the checkpoints in a folder, newest first."""
-    return sorted(folder.glob(PATTERN), key=lambda path: (_step_of(path), path.name), reverse=True)
+    return sorted(folder.glob(_PATTERN), key=lambda path: (_step_of(path), path.name), reverse=True)
 
 
 def _step_of(path: Path) -> int:

@@ -36,9 +36,9 @@ log = logging.getLogger(__name__)
 SHIPPED = Path(__file__).resolve().parents[1] / "weights" / "sweep-tiny.safetensors"
 """Head trained on ``backend=sweep``; the package also contains that backend's weights, so no download is needed."""
 PARTS = ("backend", "model", "renderer")
-SAME_OUTPUT = ("path", "pretrained", "revision", "head_chunk", "views_per_chunk")
+_SAME_OUTPUT = ("path", "pretrained", "revision", "head_chunk", "views_per_chunk")
 """Keys that do not change what a network computes, or whose effect is covered by the hash of the weights."""
-TOKENS = ("taps", "reference_view", "given_poses")
+_TOKENS = ("taps", "reference_view", "given_poses")
 """Backend keys that change its outputs for the same weights; a trained part is valid for one choice only."""
 
 RESUMED_IN_PLACE = (None, "last", "auto")
@@ -129,7 +129,7 @@ def _model_parts(ckpt: str | Path | None, overrides: Sequence[str]) -> tuple[Pat
             raise ValueError(f"option {override!r}: expected key=value with a key of {', '.join(PARTS)}")
     named = {key for key in keys if "." not in key}
     of_backend = [key.removeprefix("backend.") for key in keys if key.startswith("backend.")]
-    suits = "backend" not in named or ("backend=sweep" in overrides and all(key in SAME_OUTPUT for key in of_backend))
+    suits = "backend" not in named or ("backend=sweep" in overrides and all(key in _SAME_OUTPUT for key in of_backend))
     checkpoint = checkpoint_path(SHIPPED if ckpt is None and suits else ckpt)
     chosen = [override for override, key in zip(overrides, keys, strict=True) if key.partition(".")[0] in named]
     parts = resolve_parts(compose_groups(*chosen) if chosen else OmegaConf.create(), checkpoint)
@@ -185,7 +185,7 @@ def resolve_parts(config: DictConfig, checkpoint: Path | None) -> dict[str, Dict
 
 
 def refuse_other_tokens(backend: Any, checkpoint: Mapping[str, Any], path: Path) -> None:
-    """Raises ValueError if a backend's :data:`TOKENS` differ from those that a checkpoint was trained with.
+    """Raises ValueError if a backend's _TOKENS differ from those that a checkpoint was trained with.
 
     The hash of the weights does not cover these keys. Checkpoints without a configuration pass.
     """
@@ -199,7 +199,7 @@ def refuse_other_tokens(backend: Any, checkpoint: Mapping[str, Any], path: Path)
         return  # another network, which the hash of the weights reveals, or the same network as an ONNX bundle
     here, there = (flatten(_with_defaults(part)) for part in parts)
     for key in sorted(here.keys() & there.keys()):
-        if key.rpartition(".")[2] in TOKENS and here[key] != there[key]:
+        if key.rpartition(".")[2] in _TOKENS and here[key] != there[key]:
             raise ValueError(
                 f"{path} was trained with backend.{key}={there[key]}, but this run uses {here[key]}: use the same "
                 "value, or start a new run from these weights with init_from="

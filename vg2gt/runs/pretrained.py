@@ -10,8 +10,8 @@ from vg2gt.io.files import write_bytes, write_text
 from vg2gt.runs.checkpoints import MADE_OF, checkpoint_path, read_checkpoint, write_slim
 from vg2gt.runs.load import SHIPPED, calibration_path
 
-WEIGHTS, CONFIG = "model.safetensors", "model.yaml"
-CALIBRATION = calibration_path(Path(WEIGHTS)).name
+WEIGHTS, _CONFIG = "model.safetensors", "model.yaml"
+_CALIBRATION = calibration_path(Path(WEIGHTS)).name
 MODELS = {"sweep-tiny": SHIPPED}
 """Checkpoints of the models that ship with the package, by name; it also contains their backbone's weights."""
 
@@ -41,8 +41,8 @@ def save_pretrained(ckpt: str | Path, folder: str | Path) -> Path:
     assert checkpoint is not None
     write_slim(checkpoint, folder / WEIGHTS)
     if (known := calibration_path(checkpoint)).is_file():
-        write_bytes(folder / CALIBRATION, known.read_bytes())
-    write_text(folder / CONFIG, str(read_checkpoint(checkpoint)[MADE_OF]))
+        write_bytes(folder / _CALIBRATION, known.read_bytes())
+    write_text(folder / _CONFIG, str(read_checkpoint(checkpoint)[MADE_OF]))
     return folder
 
 
@@ -69,7 +69,7 @@ def push_to_hub(ckpt: str | Path, repo: str, folder: str | Path, private: bool =
     saved = save_pretrained(ckpt, folder)
     api = HfApi()
     api.create_repo(repo, private=private, exist_ok=True)
-    return str(api.upload_folder(repo_id=repo, folder_path=str(saved), allow_patterns=[WEIGHTS, CONFIG, CALIBRATION]))
+    return str(api.upload_folder(repo_id=repo, folder_path=str(saved), allow_patterns=[WEIGHTS, _CONFIG, _CALIBRATION]))
 
 
 def weights_file(name: str | Path, revision: str | None = None) -> Path:
@@ -91,5 +91,5 @@ def weights_file(name: str | Path, revision: str | None = None) -> Path:
             f"folder {name} does not exist; loading it from the hub needs huggingface_hub: pip install 'vg2gt[hub]'"
         ) from error
     with suppress(EntryNotFoundError):  # the model is not calibrated
-        hf_hub_download(str(name), CALIBRATION, revision=revision)
+        hf_hub_download(str(name), _CALIBRATION, revision=revision)
     return Path(hf_hub_download(str(name), WEIGHTS, revision=revision))

@@ -37,14 +37,14 @@ from vg2gt.studies.study import (
 
 log = logging.getLogger(__name__)
 
-OWN_KEYS = ("name", "seeds", "full_steps", "steps", "lr", "variants", "splits", "init_from")
-OWN_KEYS += ("protocol", "protocol_overrides")
-SETTLED_KEYS = ("seed", "ckpt", "overwrite", "output_dir", "ablation", "trainer.max_steps")
-CONTINUATION_SEED = 1000  # added to the seed: continuations do not repeat the full model's first batches
+_OWN_KEYS = ("name", "seeds", "full_steps", "steps", "lr", "variants", "splits", "init_from")
+_OWN_KEYS += ("protocol", "protocol_overrides")
+_SETTLED_KEYS = ("seed", "ckpt", "overwrite", "output_dir", "ablation", "trainer.max_steps")
+_CONTINUATION_SEED = 1000  # added to the seed: continuations do not repeat the full model's first batches
 FULL, CONTROL = "full", "new_last_layer"
-LAST_LAYER = "model.gaussians.out."
+_LAST_LAYER = "model.gaussians.out."
 
-LABELS = {
+_LABELS = {
     "rasterized": "3DGS",
     "wo_depth": "w/o Depth",
     "wo_coarse": "w/o Coarse",
@@ -53,18 +53,18 @@ LABELS = {
     FULL: "VG²GT (full)",
     CONTROL: "full, last layer new",
 }
-PAPER_COLUMNS = columns(
+_PAPER_COLUMNS = columns(
     *("psnr", "ssim", "lpips", "rmse", "abs_rel", "delta_1.25", "delta_1.05"),
     decimals={"delta_1.25": 4, "delta_1.05": 4},
 )
-OUR_COLUMNS = columns("abs_rel_rasterized", "decoded_abs_rel", "normal_mean", "cv", "gaussians")
+_OUR_COLUMNS = columns("abs_rel_rasterized", "decoded_abs_rel", "normal_mean", "cv", "gaussians")
 # The paper's tables and rows that correspond to ours (Replica).
-PAPER_ABLATION, PAPER_SPLIT, PAPER_DATA = "tbl_ablation", "tbl_split", "replica"
-# Paths of metrics in an evaluation: GT_POSE, except those in PATHS.
-GT_POSE = "rendered/gt_pose/solid/"
-CONTEXT_COLUMNS = {f"context/{name}": metric for name, metric in PAPER_COLUMNS.items()}
-PATHS = {
-    **{name: f"rendered/context/solid/{name.removeprefix('context/')}" for name in CONTEXT_COLUMNS},
+_PAPER_ABLATION, _PAPER_SPLIT, _PAPER_DATA = "tbl_ablation", "tbl_split", "replica"
+# Paths of metrics in an evaluation: _GT_POSE, except those in _PATHS.
+_GT_POSE = "rendered/gt_pose/solid/"
+_CONTEXT_COLUMNS = {f"context/{name}": metric for name, metric in _PAPER_COLUMNS.items()}
+_PATHS = {
+    **{name: f"rendered/context/solid/{name.removeprefix('context/')}" for name in _CONTEXT_COLUMNS},
     "abs_rel_rasterized": "rendered/gt_pose/rasterized/abs_rel",
     "decoded_abs_rel": "decoded/after/abs_rel",
     **{name: f"scene/{name}" for name in ("cv", "gaussians")},
@@ -140,8 +140,8 @@ class Ablation:
     def _go_on(self, name: str, seed: int, start: Path, home: Path) -> Metrics:
         if name == CONTROL:
             cut = home / "start" / "without_last_layer.ckpt"
-            start = write_part(start, cut, lambda tensor: not tensor.startswith(LAST_LAYER))
-        overrides = [*self.overrides, *self.runs[name], f"seed={CONTINUATION_SEED + seed}"]
+            start = write_part(start, cut, lambda tensor: not tensor.startswith(_LAST_LAYER))
+        overrides = [*self.overrides, *self.runs[name], f"seed={_CONTINUATION_SEED + seed}"]
         overrides += [f"trainer.max_steps={self.config.steps}", f"optimizer.lr={self.config.lr}"]
         folder = home / name.replace("=", "-")
         metrics = run_once([*overrides, f"init_from={quoted(start)}"], folder, self.config.protocol is None)
@@ -168,7 +168,7 @@ class Ablation:
             "diverged": self.diverged,
             "runs": {name: {str(seed): m for seed, m in runs.items()} for name, runs in self.results.items()},
             "summary": summarize(self.results, FULL),
-            "paper": {table: tables()[table][PAPER_DATA] for table in (PAPER_ABLATION, PAPER_SPLIT)},
+            "paper": {table: tables()[table][_PAPER_DATA] for table in (_PAPER_ABLATION, _PAPER_SPLIT)},
         }
         write_json(self.folder / "metrics.json", content)
         write_text(self.folder / "metrics.md", self.report())
@@ -185,7 +185,7 @@ class Ablation:
             "## Splits",
             _beside_paper(self.results, splits),
             "## More figures of the same runs",
-            seeds_table({_label(name): runs for name, runs in self.results.items()}, OUR_COLUMNS),
+            seeds_table({_label(name): runs for name, runs in self.results.items()}, _OUR_COLUMNS),
             "## Differences to the full model, seed by seed",
             _differences(self.results, FULL),
         ]
@@ -227,34 +227,36 @@ class Ablation:
 def _figures(report: Mapping[str, Any]) -> Metrics:
     """The metrics of an evaluation's report that the tables show, by their names in training."""
     ((_, views),) = report["views"].items()
-    names = (*PAPER_COLUMNS, *CONTEXT_COLUMNS, *OUR_COLUMNS)
-    found = {name: views["mean"].get(PATHS.get(name, GT_POSE + name)) for name in names}
+    names = (*_PAPER_COLUMNS, *_CONTEXT_COLUMNS, *_OUR_COLUMNS)
+    found = {name: views["mean"].get(_PATHS.get(name, _GT_POSE + name)) for name in names}
     return {name: value for name, value in found.items() if value is not None}
 
 
 def _label(name: str) -> str:
-    return LABELS.get(name, name)
+    return _LABELS.get(name, name)
 
 
 def _beside_paper(results: Mapping[str, Mapping[int, Metrics]], rows: Mapping[str, str]) -> str:
     """Our rows, on a protocol also of the input views, each followed by the paper's; ``rows``: names to runs."""
-    ablation, split = (tables()[table][PAPER_DATA] for table in (PAPER_ABLATION, PAPER_SPLIT))
+    ablation, split = (tables()[table][_PAPER_DATA] for table in (_PAPER_ABLATION, _PAPER_SPLIT))
     lines = []
     for name, run in rows.items():
-        lines.append([_label(name), *seeds_row(results[run], PAPER_COLUMNS)])
+        lines.append([_label(name), *seeds_row(results[run], _PAPER_COLUMNS)])
         if any("context/psnr" in metrics for metrics in results[run].values()):
-            lines.append([f"{_label(name)}, context", *seeds_row(results[run], CONTEXT_COLUMNS)])
+            lines.append([f"{_label(name)}, context", *seeds_row(results[run], _CONTEXT_COLUMNS)])
         theirs = {FULL: "VG2GT (full)", "splits=1": "w/o split"}.get(name, _label(name).replace("splits", "split"))
         paper = (split if name.startswith("splits=") else ablation).get(theirs)
         if paper:
-            lines.append(["*paper*", *(f"*{paper[metric]:g}*" for metric in PAPER_COLUMNS)])
-    return markdown_table(["", *(metric.label for metric in PAPER_COLUMNS.values())], lines)
+            lines.append(["*paper*", *(f"*{paper[metric]:g}*" for metric in _PAPER_COLUMNS)])
+    return markdown_table(["", *(metric.label for metric in _PAPER_COLUMNS.values())], lines)
 
 
 def _differences(results: Mapping[str, Mapping[int, Metrics]], reference: str) -> str:
     """Each run minus the reference, for metrics that all runs have; says whether the interval excludes zero."""
     every = [metrics for runs in results.values() for metrics in runs.values()]
-    shown = {name: m for name, m in (PAPER_COLUMNS | OUR_COLUMNS).items() if all(name in metrics for metrics in every)}
+    shown = {
+        name: m for name, m in (_PAPER_COLUMNS | _OUR_COLUMNS).items() if all(name in metrics for metrics in every)
+    }
     rows = [
         [_label(name), *(_verdict(paired_difference(runs, results[reference], key), m) for key, m in shown.items())]
         for name, runs in results.items()
@@ -277,9 +279,9 @@ def _verdict(change: Estimate, metric: Metric) -> str:
 def common_overrides(overrides: Sequence[str]) -> list[str]:
     """Returns the overrides that apply to every training; ValueError if one sets a key that the study decides."""
     keys = [override.split("=")[0].lstrip("+~") for override in overrides]
-    if settled := [key for key in keys if key in SETTLED_KEYS]:
-        raise ValueError(f"{settled[0]} is decided by the study; its own keys are {', '.join(OWN_KEYS)}")
-    return [override for override, key in zip(overrides, keys, strict=True) if key not in OWN_KEYS]
+    if settled := [key for key in keys if key in _SETTLED_KEYS]:
+        raise ValueError(f"{settled[0]} is decided by the study; its own keys are {', '.join(_OWN_KEYS)}")
+    return [override for override, key in zip(overrides, keys, strict=True) if key not in _OWN_KEYS]
 
 
 def run_study(config: DictConfig) -> None:

@@ -28,9 +28,9 @@ log = logging.getLogger(__name__)
 Metrics = dict[str, float]
 INTERRUPTED = 143
 # Settings that must be equal for two runs to be the same; folders and logging may differ.
-COMPARED = ("backend", "model", "data", "loss", "renderer", "optimizer", "training", "seed")
-COMPARED_KEYS = ("trainer.max_steps", "trainer.precision", "trainer.gradient_clip_val")
-NOT_COMPARED = ("data.workers", "data.memory_mb", "data.cache_dir")
+_COMPARED = ("backend", "model", "data", "loss", "renderer", "optimizer", "training", "seed")
+_COMPARED_KEYS = ("trainer.max_steps", "trainer.precision", "trainer.gradient_clip_val")
+_NOT_COMPARED = ("data.workers", "data.memory_mb", "data.cache_dir")
 
 
 def compose_run(overrides: Sequence[str], folder: Path) -> DictConfig:
@@ -90,7 +90,7 @@ def _refuse_other_run(config: DictConfig, folder: Path) -> None:
     other = [
         key
         for key in sorted(before.keys() | now.keys())
-        if (key.split(".")[0] in COMPARED or key in COMPARED_KEYS) and key not in NOT_COMPARED
+        if (key.split(".")[0] in _COMPARED or key in _COMPARED_KEYS) and key not in _NOT_COMPARED
         if before.get(key) != now.get(key)
     ]
     if other:

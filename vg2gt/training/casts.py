@@ -12,9 +12,9 @@ from torch import Tensor, nn
 from vg2gt.geometry.precision import autocast_dtype
 from vg2gt.method.sparse_conv import SubmanifoldConv3d
 
-CONTAINERS = (nn.Sequential, nn.ModuleList, nn.ModuleDict)
+_CONTAINERS = (nn.Sequential, nn.ModuleList, nn.ModuleDict)
 _BOTH = ("weight", "bias")
-CAST = {nn.Linear: _BOTH, nn.Conv2d: _BOTH, nn.ConvTranspose2d: _BOTH, SubmanifoldConv3d: _BOTH}
+_CAST = {nn.Linear: _BOTH, nn.Conv2d: _BOTH, nn.ConvTranspose2d: _BOTH, SubmanifoldConv3d: _BOTH}
 """What autocast casts, for exactly these types: subclasses, such as
 :class:`vg2gt.geometry.precision.Float32Linear`, keep their weights."""
 
@@ -33,7 +33,7 @@ class WeightCasts:
     def __init__(self, model: nn.Module) -> None:
         self.parts: dict[str, list[tuple[nn.Module, str]]] = {}
         for name, module in _layers(model):
-            for key in CAST[type(module)]:
+            for key in _CAST[type(module)]:
                 if (weight := module._parameters.get(key)) is not None and weight.requires_grad:
                     self.parts.setdefault(".".join(name.split(".")[:2]), []).append((module, key))
 
@@ -60,11 +60,11 @@ class WeightCasts:
 
 
 def _layers(module: nn.Module, prefix: str = "") -> Iterator[tuple[str, nn.Module]]:
-    """Returns names and layers of :data:`CAST` in torch's containers and modules of the method."""
+    """Returns names and layers of `_CAST` in torch's containers and modules of the method."""
     for name, child in module.named_children():
-        if type(child) in CAST:
+        if type(child) in _CAST:
             yield prefix + name, child
-        elif isinstance(child, CONTAINERS) or type(child).__module__.startswith("vg2gt.method."):
+        elif isinstance(child, _CONTAINERS) or type(child).__module__.startswith("vg2gt.method."):
             yield from _layers(child, f"{prefix}{name}.")
 
 

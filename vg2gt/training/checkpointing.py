@@ -18,7 +18,7 @@ from vg2gt.runs.checkpoints import by_age, read_checkpoint, write_checkpoint
 
 log = logging.getLogger(__name__)
 
-SIGNALS = (signal.SIGTERM, signal.SIGINT, *((signal.SIGUSR1,) if hasattr(signal, "SIGUSR1") else ()))
+_SIGNALS = (signal.SIGTERM, signal.SIGINT, *((signal.SIGUSR1,) if hasattr(signal, "SIGUSR1") else ()))
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
@@ -82,7 +82,7 @@ class StopOnSignal(lightning.Callback):
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Installs the signal handlers for the duration of training."""
-        self._previous = {number: signal.signal(number, self._note) for number in SIGNALS}
+        self._previous = {number: signal.signal(number, self._note) for number in _SIGNALS}
 
     def on_validation_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Outside training, SIGTERM and SIGUSR1 end an evaluation at once, as there is nothing to save.

@@ -17,7 +17,7 @@ import torch.distributed
 from torch import Tensor
 
 Value = TypeVar("Value")
-KEPT = 20  # maximum number of faults in the report of a run
+_KEPT = 20  # maximum number of faults in the report of a run
 
 
 def world_size() -> int:
@@ -70,7 +70,7 @@ class SkippedSteps:
     Attributes:
         total: steps skipped since the run began.
         in_a_row: steps skipped since the last good step.
-        faults: what was not finite in the first of them: step, rank, scenes and cause; at most :data:`KEPT`.
+        faults: what was not finite in the first of them: step, rank, scenes and cause; at most 20.
     """
 
     def __init__(self, limit: int) -> None:
@@ -85,7 +85,7 @@ class SkippedSteps:
         """Counts a skipped step; raises FloatingPointError at ``limit`` in a row."""
         self.total += 1
         self.in_a_row += 1
-        self.faults = (self.faults + faults)[:KEPT]
+        self.faults = (self.faults + faults)[:_KEPT]
         if self.in_a_row >= self.limit:
             raise FloatingPointError(
                 f"{self.in_a_row} steps in a row had a non-finite loss or gradient, the last: {'; '.join(faults)}. "

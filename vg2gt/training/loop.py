@@ -40,7 +40,7 @@ from vg2gt.training.start import checkpoint_to_resume, load_start, prepare_folde
 
 log = logging.getLogger(__name__)
 
-EXPECTED_WARNINGS = (
+_EXPECTED_WARNINGS = (
     r"Found \d+ module\(s\) in eval mode",  # the frozen backbone
     r"You're resuming from a checkpoint that ended before the epoch",  # batches are a function of the step number
     r"It is recommended to use `self.log\('eval/",  # all ranks log the same values
@@ -48,12 +48,12 @@ EXPECTED_WARNINGS = (
     r"Checkpoint directory .* exists and is not empty",  # expected when a run resumes
 )
 
-FEW_WORKERS = r"The '\w+_dataloader' does not have many workers"  # expected on a CPU, whose cores are busy training
+_FEW_WORKERS = r"The '\w+_dataloader' does not have many workers"  # expected on a CPU, whose cores are busy training
 
 # Tensor sizes vary from step to step, which would fragment GPU memory. Read when CUDA initialises.
 ALLOCATOR = (f"PYTORCH_{'' if torch.__version__ >= '2.9' else 'CUDA_'}ALLOC_CONF", "expandable_segments:True")
 
-TRAINER = {
+_TRAINER = {
     "max_epochs": -1,  # the number of steps ends a training
     "check_val_every_n_epoch": None,  # val_check_interval counts steps
     "num_sanity_val_steps": 0,
@@ -63,7 +63,7 @@ TRAINER = {
 }
 """Lightning's options that follow from how we train; ``+trainer.KEY=VALUE`` changes them."""
 
-PRECISIONS = ("auto", "32-true", "bf16-mixed", "32", "bf16")  # the last two are Lightning's short names
+_PRECISIONS = ("auto", "32-true", "bf16-mixed", "32", "bf16")  # the last two are Lightning's short names
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ def build(config: DictConfig) -> Run:
     accelerator = _accelerator(config.trainer.accelerator)
     if accelerator == "gpu":
         os.environ.setdefault(*ALLOCATOR)
-    for message in EXPECTED_WARNINGS if accelerator == "gpu" else (*EXPECTED_WARNINGS, FEW_WORKERS):
+    for message in _EXPECTED_WARNINGS if accelerator == "gpu" else (*_EXPECTED_WARNINGS, _FEW_WORKERS):
         warnings.filterwarnings("ignore", message=message)
     _quieten_lightning()
     datamodule = instantiate(config.data)
@@ -114,7 +114,7 @@ def build(config: DictConfig) -> Run:
     module.made_of = made_of(config)
     trainer = instantiate(
         config.trainer,
-        **{key: value for key, value in TRAINER.items() if key not in config.trainer},
+        **{key: value for key, value in _TRAINER.items() if key not in config.trainer},
         accelerator=accelerator,
         precision=trainer_precision(str(config.trainer.precision), accelerator),
         callbacks=_callbacks(config),
@@ -167,7 +167,7 @@ def _accelerator(asked: str) -> str:
 def _check(config: DictConfig) -> None:
     """Raises ValueError for options of the trainer and the loss that would silently mean something else."""
     trainer = config.trainer
-    if str(trainer.precision) not in PRECISIONS:
+    if str(trainer.precision) not in _PRECISIONS:
         raise ValueError(
             f"trainer.precision={trainer.precision} is not supported: geometry, voxels, rendering and losses require "
             "float32 (half precision is too coarse, float64 brings no gain); use bf16-mixed (networks in bfloat16), "
@@ -214,7 +214,7 @@ def train(config: DictConfig) -> dict[str, Any]:
     with only_process_in(config.output_dir) if writes else nullcontext():
         checkpoint = checkpoint_to_resume(config)
         run = build(config)
-        check_run(run)
+        _check_run(run)
         load_start(run.module, config, checkpoint)
         if writes:
             prepare_folder(config, checkpoint)
@@ -227,7 +227,7 @@ def train(config: DictConfig) -> dict[str, Any]:
             return report(run, untrained, evaluate(run))
 
 
-def check_run(run: Run) -> None:
+def _check_run(run: Run) -> None:
     """Checks a run before training.
 
     Raises:

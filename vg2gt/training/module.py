@@ -31,7 +31,7 @@ from vg2gt.types import Batch, Prediction
 log = logging.getLogger(__name__)
 
 Part = Literal["all", "coarse"]
-IN_PROGRESS_BAR = ("loss", "train/color_l1", "train/depth_gt", "train/depth_reg", "train/normal")
+_IN_PROGRESS_BAR = ("loss", "train/color_l1", "train/depth_gt", "train/depth_reg", "train/normal")
 
 
 class VG2GTModule(lightning.LightningModule):
@@ -211,7 +211,7 @@ class VG2GTModule(lightning.LightningModule):
         if average:
             values = self.trainer.strategy.reduce(values, reduce_op="mean")
         for name, value in zip(self._figures, values, strict=True):
-            self.log(name, value, prog_bar=name in IN_PROGRESS_BAR)
+            self.log(name, value, prog_bar=name in _IN_PROGRESS_BAR)
 
     def configure_gradient_clipping(
         self,

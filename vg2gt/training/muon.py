@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-QUINTIC = (3.4445, -4.7750, 2.0315)  # brings singular values to 0.7-1.2 in five steps; steepest at 0
-LIKE_ADAMW = 0.2  # root mean square of AdamW's updates
+_QUINTIC = (3.4445, -4.7750, 2.0315)  # brings singular values to 0.7-1.2 in five steps; steepest at 0
+_LIKE_ADAMW = 0.2  # root mean square of AdamW's updates
 TINY = 1e-7
 
 
@@ -62,7 +62,7 @@ class MuonAdamW(torch.optim.AdamW):
         updates = orthogonalized([self._nesterov(matrix) for _, matrix in matrices])
         kept = [matrix.grad for _, matrix in matrices]
         for (group, matrix), update in zip(matrices, updates, strict=True):
-            size = LIKE_ADAMW * max(update.shape) ** 0.5
+            size = _LIKE_ADAMW * max(update.shape) ** 0.5
             matrix.mul_(1 - group["lr"] * group["weight_decay"])
             matrix.add_(update.view_as(matrix), alpha=-group["lr"] * size)
             matrix.grad = None  # AdamW skips parameters without a gradient
@@ -119,7 +119,7 @@ def _orthogonalized(x: Tensor, steps: int) -> Tensor:
     """:func:`orthogonalized` for a stack ``[n, a, b]``; tall matrices are transposed so that products are smaller."""
     if x.shape[1] > x.shape[2]:
         return _orthogonalized(x.mT, steps).mT
-    linear, cubic, quintic = QUINTIC
+    linear, cubic, quintic = _QUINTIC
     x = x / (torch.linalg.matrix_norm(x, keepdim=True) + TINY)
     for _ in range(steps):
         square = x @ x.mT

@@ -29,9 +29,9 @@ ROWS = columns(
         "cv": "uniformity CV (k = 8)",
     },
 )
-HEAD = ("", "untrained", "trained", "change")
-PREVIEWED = 3  # maximum number of scenes in the preview
-CAPTION = "views never trained on, at ground-truth poses; depth aligned by one median scale per scene"
+_HEAD = ("", "untrained", "trained", "change")
+_PREVIEWED = 3  # maximum number of scenes in the preview
+_CAPTION = "views never trained on, at ground-truth poses; depth aligned by one median scale per scene"
 
 
 def comparison_table(untrained: dict[str, float], trained: dict[str, float]) -> str:
@@ -43,7 +43,7 @@ def comparison_table(untrained: dict[str, float], trained: dict[str, float]) -> 
         relative = f" ({change / before:+.0%})" if before and math.isfinite(change) else ""
         shown = [number(before, metric.decimals), number(after, metric.decimals)]
         rows.append([metric.label, *shown, number(change, metric.decimals, sign=True) + relative])
-    return f"{markdown_table(HEAD, rows)}\n\n{CAPTION}.\n"
+    return f"{markdown_table(_HEAD, rows)}\n\n{_CAPTION}.\n"
 
 
 @torch.no_grad()
@@ -63,9 +63,9 @@ def write_preview(module: VG2GTModule, datamodule: LightningDataModule, path: st
     for batch in datamodule.val_dataloader():
         for index in range(len(batch.scene)):
             rows.append(_row(module, batch.single(index).to(module.device)))
-        if len(rows) >= PREVIEWED:
+        if len(rows) >= _PREVIEWED:
             break
-    return write_png(path, grid(rows[:PREVIEWED]))
+    return write_png(path, grid(rows[:_PREVIEWED]))
 
 
 def _row(module: VG2GTModule, batch: Batch) -> list[torch.Tensor]:

@@ -25,11 +25,11 @@ from vg2gt.runs.load import RESUMED_IN_PLACE, constructor_defaults, earlier_conf
 from vg2gt.runs.untrusted import read_run_config
 from vg2gt.training.module import VG2GTModule
 
-IN_OPTIMIZER = ("training.part", "training.coarse_lr_factor", "training.backend_lr_factor", "backend.freeze")
+_IN_OPTIMIZER = ("training.part", "training.coarse_lr_factor", "training.backend_lr_factor", "backend.freeze")
 """Keys besides ``optimizer.*`` that a checkpoint's optimiser state determines, so that a resumed run ignores them."""
-HARDWARE = "optimizer.fused"  # set by trainer=gpu; does not change what is computed
+_HARDWARE = "optimizer.fused"  # set by trainer=gpu; does not change what is computed
 ORIGIN = ("data", "init_from", "ckpt")  # what a run was trained on, which an evaluation reads
-LOADING = ("data.steps_per_epoch", "data.workers", "data.memory_mb")  # do not change which scenes those are
+_LOADING = ("data.steps_per_epoch", "data.workers", "data.memory_mb")  # do not change which scenes those are
 
 log = logging.getLogger(__name__)
 
@@ -122,7 +122,7 @@ def _origin(config: DictConfig) -> dict[str, Any]:
     return {
         key: None if key in ("init_from", "ckpt") and value in RESUMED_IN_PLACE else value
         for key, value in plain.items()
-        if key.partition(".")[0] in ORIGIN and key not in LOADING
+        if key.partition(".")[0] in ORIGIN and key not in _LOADING
     }
 
 
@@ -141,8 +141,8 @@ def name_differences(config: DictConfig, checkpoint: Path) -> None:
         before, now = defaults | before, defaults | now  # a former version wrote more of them
     different = sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))
     for key in different:
-        of_optimizer = "optimizer._target_" in before and key.startswith("optimizer.") and key != HARDWARE
-        if of_optimizer or (key in IN_OPTIMIZER and key in before and key in now):
+        of_optimizer = "optimizer._target_" in before and key.startswith("optimizer.") and key != _HARDWARE
+        if of_optimizer or (key in _IN_OPTIMIZER and key in before and key in now):
             raise ValueError(
                 f"{key}={now.get(key, 'not set')} differs from {before.get(key, 'not set')}, with which the run was "
                 "trained: a resumed run continues with its optimiser's state, which includes it. Keep the old value, "

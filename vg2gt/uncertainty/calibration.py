@@ -31,14 +31,14 @@ from vg2gt.visibility.evidence import EVIDENCE, Status
 
 LEVELS = (0.5, 0.8, 0.9, 0.95)
 STATED = 0.9  # level of the bound called ``error``
-UNKNOWN = math.inf  # bound where no depth is measured
+_UNKNOWN = math.inf  # bound where no depth is measured
 MEASURED = (Status.CONTRADICTED, Status.SINGLE, Status.AGREED)  # statuses with a depth
-KNOTS, BINS = 8, 24
-SCENE_KNOTS = 2  # for evidence shared by a whole scene, which has few distinct values
+_KNOTS, _BINS = 8, 24
+_SCENE_KNOTS = 2  # for evidence shared by a whole scene, which has few distinct values
 FEWEST = 4  # minimum number of scenes
 SMALLEST = 1e-4  # smaller errors are clamped to this
-RIDGE = 1e-3  # per sample, so that constant evidence gets no weight
-LEAST = 50 * BINS  # minimum number of pixels of a status
+_RIDGE = 1e-3  # per sample, so that constant evidence gets no weight
+LEAST = 50 * _BINS  # minimum number of pixels of a status
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ class Calibration:
     def bounds(self, evidence: Tensor, status: Tensor) -> Tensor:
         """Returns bounds ``[L, ...]`` at :data:`LEVELS` for evidence ``[..., F]``; infinite without a depth."""
         flat, statuses = evidence.flatten(0, -2), status.flatten()
-        found = torch.full((len(LEVELS), len(flat)), UNKNOWN, device=evidence.device)
+        found = torch.full((len(LEVELS), len(flat)), _UNKNOWN, device=evidence.device)
         for kind, curve in self.curves.items():
             rows = (statuses == kind).nonzero()[:, 0]
             found[:, rows] = curve(flat[rows])
@@ -199,12 +199,12 @@ def _fit(order: Samples, meaning: Samples) -> Curve:
         [_hats(column.double(), k) for column, k in zip(order.evidence.unbind(-1), knots, strict=True)], 1
     )
     target = order.error.double().clamp(min=SMALLEST).log()
-    normal = basis.T @ basis + RIDGE * len(basis) * torch.eye(basis.shape[1], dtype=torch.float64)
+    normal = basis.T @ basis + _RIDGE * len(basis) * torch.eye(basis.shape[1], dtype=torch.float64)
     solved = torch.linalg.solve(normal, basis.T @ (target - target.mean()))
     values = solved.split([len(k) for k in knots])
     curve = Curve(tuple(k.float() for k in knots), tuple(v.float() for v in values), torch.zeros(1), torch.ones(1, 1))
     score = curve.score(meaning.evidence)
-    bins = score.argsort(stable=True).tensor_split(BINS)
+    bins = score.argsort(stable=True).tensor_split(_BINS)
     errors = [meaning.error[rows].clamp(min=SMALLEST) for rows in bins]
     bounds = torch.stack([increasing_quantiles(errors, level) for level in LEVELS])
     return Curve(curve.knots, curve.values, torch.stack([score[rows].mean() for rows in bins]), bounds)
@@ -212,7 +212,7 @@ def _fit(order: Samples, meaning: Samples) -> Curve:
 
 def _knots(column: Tensor, name: str) -> Tensor:
     """Returns increasing quantiles ``[K]`` of one kind of evidence."""
-    steps = np.linspace(0, 1, SCENE_KNOTS if name == "differences" else KNOTS)
+    steps = np.linspace(0, 1, _SCENE_KNOTS if name == "differences" else _KNOTS)
     return torch.from_numpy(np.quantile(column.double().numpy(), steps)).unique()
 
 

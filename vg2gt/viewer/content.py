@@ -19,8 +19,8 @@ from vg2gt.io.points import scene_extent
 from vg2gt.rendering.options import RenderOptions
 from vg2gt.types import Gaussians
 
-FRUSTUM_SHARE = 0.02  # depth of a drawn frustum, relative to the scene's extent
-PICTURE_SIDE = 320  # longer side of an image shown in its frustum, in pixels
+_FRUSTUM_SHARE = 0.02  # depth of a drawn frustum, relative to the scene's extent
+_PICTURE_SIDE = 320  # longer side of an image shown in its frustum, in pixels
 _DEFAULT_SIZE = (960, 720)  # width and height of the default view
 _INSIDE_SHARE = 0.1  # minimum share of Gaussians in view for the default view to be the world frame
 
@@ -52,7 +52,7 @@ class ViewerScene:
     def frustum_depth(self) -> float:
         """Returns the distance from a camera's centre to its drawn image, in scene units."""
         centers = np.stack([invert_pose(camera.world_to_camera)[:3, 3] for camera in self.cameras or [self.initial()]])
-        return FRUSTUM_SHARE * scene_extent(self.gaussians.means.detach().cpu().double().numpy(), centers)
+        return _FRUSTUM_SHARE * scene_extent(self.gaussians.means.detach().cpu().double().numpy(), centers)
 
 
 def _default_camera(gaussians: Gaussians) -> NamedCamera:
@@ -89,7 +89,7 @@ def load_pictures(cameras: Sequence[NamedCamera], source: str | Path) -> list[ND
         source: the folder of the images, or a ``views.npz`` of the same scene.
 
     Returns:
-        One per camera, the longer side at most ``PICTURE_SIDE`` pixels; None if ``source`` has no such image (names
+        One per camera, the longer side at most ``_PICTURE_SIDE`` pixels; None if ``source`` has no such image (names
         that lead out of the folder count as missing).
 
     Raises:
@@ -120,14 +120,14 @@ def _pictures_of_views(cameras: Sequence[NamedCamera], path: Path) -> list[NDArr
 def _picture(path: Path) -> NDArray[np.uint8]:
     try:
         with open_image(path) as image:
-            image.draft("RGB", (2 * PICTURE_SIDE, 2 * PICTURE_SIDE))  # JPEG decodes to a smaller size
+            image.draft("RGB", (2 * _PICTURE_SIDE, 2 * _PICTURE_SIDE))  # JPEG decodes to a smaller size
             return thumbnail(np.asarray(color_image(ImageOps.exif_transpose(image) or image)))
     except Exception as error:  # image libraries raise many kinds of errors
         raise ValueError(f"cannot read {path}: {error}; restore or remove the image") from error
 
 
 def thumbnail(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Returns an image ``[H, W, 3]`` uint8 reduced to at most ``PICTURE_SIDE`` pixels on its longer side."""
+    """Returns an image ``[H, W, 3]`` uint8 reduced to at most ``_PICTURE_SIDE`` pixels on its longer side."""
     image = Image.fromarray(pixels)
-    image.thumbnail((PICTURE_SIDE, PICTURE_SIDE))
+    image.thumbnail((_PICTURE_SIDE, _PICTURE_SIDE))
     return np.array(image)

@@ -28,7 +28,7 @@ from vg2gt.viewer.packing import pack, without_zeros
 STATIC = Path(__file__).with_name("static")
 _PARTS = "address shaders decode sorting detail camera levels picking controls renderer tools main"
 SCRIPTS = tuple(f"{name}.js" for name in _PARTS.split())
-JPEG_QUALITY = 85
+_JPEG_QUALITY = 85
 
 
 def write_viewer_html(path: str | Path, scene: ViewerScene, levels: bool = False) -> Path:
@@ -96,7 +96,7 @@ def _content(scene: ViewerScene, header: dict[str, float]) -> dict[str, Any]:
 
 
 def _jpeg(picture: NDArray[np.uint8]) -> str:
-    return base64.b64encode(encode_image(picture, "JPEG", quality=JPEG_QUALITY)).decode()
+    return base64.b64encode(encode_image(picture, "JPEG", quality=_JPEG_QUALITY)).decode()
 
 
 def _json_in_html(content: Any) -> str:

@@ -10,7 +10,7 @@ from vg2gt.types import Geometry
 from vg2gt.visibility.check import ViewCheck, choose_partners
 from vg2gt.visibility.counts import count_views
 
-AROUND = 9  # pixels per side of the square whose share of confirmed pixels is the weight; a hard choice leaves steps
+_AROUND = 9  # pixels per side of the square whose share of confirmed pixels is the weight; a hard choice leaves steps
 
 
 def keep_agreed(initial: Geometry, depth: Tensor, check: ViewCheck) -> Tensor:
@@ -42,4 +42,4 @@ def _confirmed(depth: Tensor, initial: Geometry, scene: int, check: ViewCheck) -
     partners = choose_partners(depth, cameras, check.partners)
     counts = count_views(depth, cameras, partners, check.tolerance, check.margin)
     confirmed = (counts.agree >= 1) & (counts.through == 0)
-    return F.avg_pool2d(confirmed.to(depth.dtype)[:, None], AROUND, 1, AROUND // 2, count_include_pad=False)[:, 0]
+    return F.avg_pool2d(confirmed.to(depth.dtype)[:, None], _AROUND, 1, _AROUND // 2, count_include_pad=False)[:, 0]

@@ -18,12 +18,12 @@ from vg2gt.visibility.counts import count_views, depth_ratio
 
 STRIDE = 4  # pixels between samples of the disagreement, along each axis
 NEIGHBORS = 8  # partners per view for the disagreement
-LOOKED_AT = 32  # evenly spaced views whose disagreement is measured if there are MANY
+_LOOKED_AT = 32  # evenly spaced views whose disagreement is measured if there are MANY
 SAMPLES = 12  # pixels per side of the grid on which overlap is measured
-# Above MANY views, a view has MORE times as many partners, hidden points do not count, and near views count more.
-MANY, MORE = 100, 4
+# Above MANY views, a view has _MORE times as many partners, hidden points do not count, and near views count more.
+MANY, _MORE = 100, 4
 BEHIND = 1.1  # relative to a view's depth; points farther away are hidden from it
-LEAST_OVERLAP = 0.02  # smallest share of a view's samples in the image of a partner
+_LEAST_OVERLAP = 0.02  # smallest share of a view's samples in the image of a partner
 LEAST = 2  # smallest number of views of a moment that look through a moved point, while none of them agrees
 
 
@@ -148,7 +148,7 @@ class ViewCheck:
         """Returns the factor on the smallest voxel size, a scalar; arguments as for :meth:`in_blocks`."""
         chosen = torch.arange(len(depth), device=partners.device)
         if len(depth) > MANY:
-            chosen = torch.linspace(0, len(depth) - 1, LOOKED_AT, device=partners.device).round().long()
+            chosen = torch.linspace(0, len(depth) - 1, _LOOKED_AT, device=partners.device).round().long()
         views, local = _neighbourhood(partners[:, :NEIGHBORS], chosen)
         return (disagreement(depth[views], cameras.select(views), local) / self.fine_below).clamp(1, self.coarsest)
 
@@ -260,7 +260,7 @@ def choose_partners(depth: Tensor, cameras: Cameras, most: int) -> Tensor:
         ``[V, K]`` int64, nearest first; -1 where a view has fewer.
     """
     views, height, width = depth.shape
-    count = min(most * (MORE if views > MANY else 1), views - 1)
+    count = min(most * (_MORE if views > MANY else 1), views - 1)
     if count < 1:
         return torch.empty(views, 0, dtype=torch.int64, device=depth.device)
     step = (max(height // SAMPLES, 1), max(width // SAMPLES, 1))
@@ -284,9 +284,9 @@ def choose_partners(depth: Tensor, cameras: Cameras, most: int) -> Tensor:
         share[:, other] = inside.sum(1) / known.sum(1).clamp(min=1)
     share.fill_diagonal_(0)
     turn = torch.einsum("vij,wij->vw", pose[:, :3, :3], pose[:, :3, :3])  # 1 + 2 cos of the angle between views
-    score = torch.where(share >= LEAST_OVERLAP, share * (turn + 2), -1.0)
+    score = torch.where(share >= _LEAST_OVERLAP, share * (turn + 2), -1.0)
     ranked = score.argsort(dim=1, descending=True, stable=True)
-    usable = (share >= LEAST_OVERLAP).sum(1)
+    usable = (share >= _LEAST_OVERLAP).sum(1)
     return torch.stack([_spread(order, int(n), count) for order, n in zip(ranked, usable.tolist(), strict=True)])
 
 

@@ -15,8 +15,8 @@ from vg2gt.visibility.counts import count_views
 
 TOLERANCE, MARGIN = 0.02, 0.04  # relative depth differences at which views agree, or look through
 CLOSE = 0.005  # relative depth difference at which views agree closely
-POINT_TOLERANCE, POINT_MARGIN = 0.03, 0.05  # the same for points, which lie on a voxel's mean surface
-PARTNERS = 24  # maximum number of views that each view is compared with
+_POINT_TOLERANCE, _POINT_MARGIN = 0.03, 0.05  # the same for points, which lie on a voxel's mean surface
+_PARTNERS = 24  # maximum number of views that each view is compared with
 EVIDENCE = ("confidence", "views", "closely", "against", "step", "parallax", "differences")
 
 
@@ -57,7 +57,7 @@ def pixel_evidence(geometry: Geometry, keep: Tensor | None = None) -> tuple[Tens
     """
     depth = geometry.depth[0].float().nan_to_num(0.0, 0.0, 0.0).clamp(min=0)
     cameras, known = geometry.cameras, depth > 0
-    partners = choose_partners(depth, cameras, PARTNERS)
+    partners = choose_partners(depth, cameras, _PARTNERS)
     near = count_views(depth, cameras, partners, CLOSE, MARGIN).agree
     counts = count_views(depth, cameras, partners, TOLERANCE, MARGIN)
     seen = counts.agree + counts.through + counts.hidden
@@ -111,9 +111,9 @@ def point_support(
         found = depth[view].flatten()[index]
         ratio = z[0, 0] / found.clamp(min=1e-12)
         known = inside & (found > 0)
-        agrees = known & ((ratio - 1).abs() < POINT_TOLERANCE)
+        agrees = known & ((ratio - 1).abs() < _POINT_TOLERANCE)
         agree += agrees
-        through += known & (ratio < 1 - POINT_MARGIN)
+        through += known & (ratio < 1 - _POINT_MARGIN)
         blank += inside & (found <= 0)
         own = torch.maximum(ratio, 1 / ratio.clamp(min=1e-12)) - 1  # of the point to the pixel
         own = own if error is None else own + (1 + own) * error[view].flatten()[index]

@@ -16,7 +16,7 @@ from vg2gt.data.sources.index import SceneIndex, check_found, make_index
 from vg2gt.data.sources.parsing import expanded, numbered, read_numbers, read_text_lines, rigid
 from vg2gt.io.cameras_json import invert_pose
 
-EARTH_RADIUS = 6378137.0
+_EARTH_RADIUS = 6378137.0
 """Equatorial radius in metres, as in KITTI's own tools."""
 
 _CALIBRATION = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt", "calib_imu_to_velo.txt")
@@ -106,8 +106,8 @@ def imu_to_world(packets: Mapping[int, NDArray[np.float64]]) -> dict[int, NDArra
     first = int((np.isfinite(values).all(1) & (np.abs(latitude) < 90)).argmax())
     scale = np.cos(np.deg2rad(latitude[first]))
     with np.errstate(all="ignore"):  # a broken packet gives NaN, which drops its frame
-        east = scale * EARTH_RADIUS * np.deg2rad(longitude)
-        north = scale * EARTH_RADIUS * np.log(np.tan(np.deg2rad(90 + latitude) / 2))
+        east = scale * _EARTH_RADIUS * np.deg2rad(longitude)
+        north = scale * _EARTH_RADIUS * np.log(np.tan(np.deg2rad(90 + latitude) / 2))
         position = np.stack((east, north, altitude), -1)
         poses = np.tile(np.eye(4), (len(values), 1, 1))
         poses[:, :3, :3] = Rotation.from_euler("xyz", np.stack((roll, pitch, yaw), -1)).as_matrix()

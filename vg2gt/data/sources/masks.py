@@ -50,7 +50,7 @@ def _mask_folder(folder: Path, changed: int) -> Path | None:
     return folder / min(found, key=lambda name: (_FOLDERS.index(name.lower()), name)) if found else None
 
 
-def mask_of(folder: Path, name: str) -> Path | None:
+def _mask_of(folder: Path, name: str) -> Path | None:
     """Finds the mask of an image: ``NAME.png`` as in COLMAP, the name with another suffix, or the same name.
 
     ``_mask`` or ``.mask`` may be before the suffix.
@@ -133,7 +133,7 @@ def mask_beside(image: Path) -> Path | None:
         if masks is None:
             continue
         for dropped in range(len(parts) if len(parts) < 3 or is_image_folder(parts[0]) else 1):
-            mask = mask_of(masks, "/".join(parts[dropped:]))
+            mask = _mask_of(masks, "/".join(parts[dropped:]))
             if mask is not None:
                 _check_owner(mask, folder, parts, dropped)
                 return mask
@@ -185,7 +185,7 @@ def find_masks(
         AmbiguousMaskError: if a mask may be that of another image of the same name.
     """
     folder = mask_folder(folder.parent) or folder
-    found = {i: known.get(i) or mask_beside(images[i]) or mask_of(folder, name) for i, name in names.items()}
+    found = {i: known.get(i) or mask_beside(images[i]) or _mask_of(folder, name) for i, name in names.items()}
     if not folder.is_dir() and not any(found.values()):
         warn_of_unused({folder.parent})
         return {}

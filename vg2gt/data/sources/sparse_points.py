@@ -13,16 +13,16 @@ from vg2gt.data.sources.undistortion import pinhole_camera
 from vg2gt.io import colmap_images, colmap_pose
 from vg2gt.io.colmap import Camera, Reconstruction
 
-MIN_TRACK = 3
+_MIN_TRACK = 3
 """Minimum number of views that observe a point; two cannot reveal a wrong match."""
-MAX_REPROJECTION = 2.0
+_MAX_REPROJECTION = 2.0
 """Maximum reprojection error of an observation, in pixels of the model's images."""
 MIN_ANGLE = 2.0
 """Minimum angle between two of a point's rays, in degrees.
 
 Below it, half a pixel of noise at a focal length of 1000 gives a depth error of 1.5 %.
 """
-MAX_GAP = 0.25
+_MAX_GAP = 0.25
 """Maximum distance to a point's third-nearest neighbour, as a fraction of its distance from the cameras.
 
 Points beyond it are isolated and count as outliers.
@@ -54,7 +54,7 @@ class SparsePoints:
 
     Args:
         model: the structure-from-motion model; not changed.
-        sound: leave out likely outliers: points with fewer than ``MIN_TRACK`` views or nearly parallel rays, isolated
+        sound: leave out likely outliers: points with fewer than ``_MIN_TRACK`` views or nearly parallel rays, isolated
             points, points whose reprojection error is too large in more than half of their views, and single
             observations with too large an error.
     """
@@ -73,7 +73,7 @@ class SparsePoints:
             inside = (places >= 0).all(1) & (places < 1).all(1)
             good = inside & (depth > 1e-6) & (depth < _FAR)
             if sound:
-                good &= np.linalg.norm(image.camera.img_from_cam(seen) - features, axis=1) <= MAX_REPROJECTION
+                good &= np.linalg.norm(image.camera.img_from_cam(seen) - features, axis=1) <= _MAX_REPROJECTION
             views.append((owner[inside], places[inside], depth[inside].astype(np.float32), good[inside]))
         owners, rows = np.unique(np.concatenate([view[0] for view in views]), return_inverse=True)
         agreeing = np.bincount(rows, np.concatenate([view[3] for view in views]), len(owners))
@@ -100,7 +100,7 @@ def _without_outliers(model: Reconstruction) -> Reconstruction:
 
     model = deepcopy(model)
     manager = pycolmap.ObservationManager(model)
-    manager.filter_points3D_with_short_tracks(MIN_TRACK)
+    manager.filter_points3D_with_short_tracks(_MIN_TRACK)
     manager.filter_points3D_with_small_triangulation_angle(MIN_ANGLE, model.point3D_ids())
     points = dict(model.points3D)
     if len(points) <= 10 * _NEIGHBOURS:  # too few to tell which are isolated
@@ -112,6 +112,6 @@ def _without_outliers(model: Reconstruction) -> Reconstruction:
     ]
     positions = np.array([point.xyz for point in points.values()])
     gaps = np.asarray(KDTree(positions).query(positions, _NEIGHBOURS + 1)[0])[:, -1]
-    for number in np.array(list(points))[gaps > MAX_GAP * np.array(distances)]:
+    for number in np.array(list(points))[gaps > _MAX_GAP * np.array(distances)]:
         model.delete_point3D(number)
     return model

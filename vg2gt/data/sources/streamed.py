@@ -21,7 +21,7 @@ from vg2gt.data.base import DataError, Frames, SceneSource
 from vg2gt.data.transforms import from_bytes, to_bytes
 
 CHUNK = "64MB"
-TRAITS = ("is_metric", "has_depth", "dense_depth", "has_cameras")
+_TRAITS = ("is_metric", "has_depth", "dense_depth", "has_cameras")
 
 
 class Streamed(SceneSource):
@@ -40,7 +40,7 @@ class Streamed(SceneSource):
             raise DataError("data.root must be the folder or address that vg2gt data stream wrote to")
         self.root = f"{os.path.expanduser(root).rstrip('/')}/{split}"
         header = json.loads(self._item(0))
-        for name in TRAITS:
+        for name in _TRAITS:
             setattr(self, name, header[name])
         self._parts: dict[str, float] = header["parts"]
         self._scenes: dict[str, dict[str, Any]] = header["scenes"]
@@ -150,7 +150,7 @@ class _Packer:
             }
             for scene in self.scenes
         }
-        return {name: getattr(source, name) for name in TRAITS} | {"parts": dict(source.parts()), "scenes": scenes}
+        return {name: getattr(source, name) for name in _TRAITS} | {"parts": dict(source.parts()), "scenes": scenes}
 
 
 def _pack(frames: Frames) -> bytes:

@@ -90,7 +90,7 @@ class Undistortion:
         size = (round(self.size[0] * scale[0]), round(self.size[1] * scale[1]))
         matrix = torch.from_numpy(self.intrinsics)
         matrix = resize_intrinsics(matrix, size[1] / self.size[1], size[0] / self.size[0]).numpy()
-        return Undistortion(lens_size, size, matrix, resized_camera(self.camera, lens_size))
+        return Undistortion(lens_size, size, matrix, _resized_camera(self.camera, lens_size))
 
     def color(self, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Undistorts an image ``[h, w, C]`` by bilinear lookup."""
@@ -127,7 +127,7 @@ def undistortion_of(lens: str, reduced: Size | None = None) -> Undistortion:
     return Undistortion.of(camera)
 
 
-def resized_camera(camera: Camera, size: Size) -> Camera:
+def _resized_camera(camera: Camera, size: Size) -> Camera:
     """Returns a camera for images resized to ``(height, width)``."""
     resized = type(camera)(camera.todict())
     resized.rescale(size[1], size[0])
@@ -136,7 +136,7 @@ def resized_camera(camera: Camera, size: Size) -> Camera:
 
 def lens_text(camera: Camera, size: Size) -> str:
     """Serialises a camera, resized to images of ``(height, width)``, as ``MODEL WIDTH HEIGHT PARAMETERS``."""
-    resized = resized_camera(camera, size)
+    resized = _resized_camera(camera, size)
     params = " ".join(repr(float(value)) for value in resized.params)
     return f"{resized.model_name} {size[1]} {size[0]} {params}"
 

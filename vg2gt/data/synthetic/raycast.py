@@ -18,8 +18,8 @@ from vg2gt.kernels.compiled import kernel, kernel_part
 BOX, CYLINDER, ELLIPSOID = 0, 1, 2
 
 # Columns of a part: centre, squared bounding radius, 3x3 axes (rows, row-major), half extents along them, kind.
-CENTER, RADIUS2, AXES, HALF, KIND, PART_COLUMNS = 0, 3, 4, 13, 16, 17
-# Columns of a group: centre and radius of its bounding sphere (CENTER, RADIUS), parts FIRST to LAST (exclusive).
+_CENTER, _RADIUS2, AXES, HALF, KIND, PART_COLUMNS = 0, 3, 4, 13, 16, 17
+# Columns of a group: centre and radius of its bounding sphere (_CENTER, RADIUS), parts FIRST to LAST (exclusive).
 RADIUS, FIRST, LAST, GROUP_COLUMNS = 3, 4, 5, 6
 
 FAR = 1e9
@@ -67,7 +67,7 @@ def intersect_part(i, parts, ox, oy, oz, dx, dy, dz):
     x, y, z = parts[i, 0] - ox, parts[i, 1] - oy, parts[i, 2] - oz
     along = x * dx + y * dy + z * dz
     squared = x * x + y * y + z * z
-    radius2 = parts[i, RADIUS2]
+    radius2 = parts[i, _RADIUS2]
     if squared - along * along > radius2 or (along < 0.0 and squared > radius2):
         return FAR
     kind = parts[i, KIND]
@@ -185,7 +185,7 @@ def parts_in_cone(apex, axis, spread, reach, parts, groups, visible, near):
             continue
         for i in range(int(groups[g, FIRST]), int(groups[g, LAST])):
             x, y, z = parts[i, 0] - apex[0], parts[i, 1] - apex[1], parts[i, 2] - apex[2]
-            if _enters_cone(x, y, z, math.sqrt(parts[i, RADIUS2]), axis, spread, reach) == FAR:
+            if _enters_cone(x, y, z, math.sqrt(parts[i, _RADIUS2]), axis, spread, reach) == FAR:
                 continue
             k = count
             while k > 0 and near[k - 1] > least:

@@ -24,9 +24,9 @@ GAMMA = 1 / 1.8
 
 # Columns of a sky: linear colours at the horizon and the zenith; direction and glow of the sun; cover, frequency and
 # seed of the clouds.
-HORIZON, ZENITH, SUN, GLOW, CLOUDS, CLOUD_FREQUENCY, CLOUD_SEED, SKY_COLUMNS = 0, 3, 6, 9, 10, 11, 12, 13
+_HORIZON, _ZENITH, _SUN, _GLOW, CLOUDS, _CLOUD_FREQUENCY, _CLOUD_SEED, SKY_COLUMNS = 0, 3, 6, 9, 10, 11, 12, 13
 
-GROUND = -5  # hit of a ray that leaves an open world downwards (-1 - floor); all other walls are sky
+_GROUND = -5  # hit of a ray that leaves an open world downwards (-1 - floor); all other walls are sky
 
 
 @dataclass(frozen=True)
@@ -115,15 +115,15 @@ def _add_sky(sky, d, angle, color):
     """Adds the linear colour of the sky in unit direction ``d`` to ``color``; ``angle`` is the pixel width (rad)."""
     height = max(d[2], 0.0)
     blend = math.sqrt(height)
-    toward = max(d[0] * sky[SUN] + d[1] * sky[SUN + 1] + d[2] * sky[SUN + 2], 0.0)
-    glow = sky[GLOW] * (toward**8 + 4.0 * toward**400)
+    toward = max(d[0] * sky[_SUN] + d[1] * sky[_SUN + 1] + d[2] * sky[_SUN + 2], 0.0)
+    glow = sky[_GLOW] * (toward**8 + 4.0 * toward**400)
     cover = 0.0
     if height > 0.02 and sky[CLOUDS] > 0.0:  # clouds lie on a plane overhead and fade towards the horizon
         u, v = d[0] / height, d[1] / height
-        noise = fractal_noise(u, v, sky[CLOUD_FREQUENCY], 5, angle / (height * height), int(sky[CLOUD_SEED]))
+        noise = fractal_noise(u, v, sky[_CLOUD_FREQUENCY], 5, angle / (height * height), int(sky[_CLOUD_SEED]))
         cover = min(max(sky[CLOUDS] * (noise + 0.1), 0.0), 1.0) * min(6.0 * height, 1.0)
     for i in range(3):
-        clear = sky[HORIZON + i] + blend * (sky[ZENITH + i] - sky[HORIZON + i])
+        clear = sky[_HORIZON + i] + blend * (sky[_ZENITH + i] - sky[_HORIZON + i])
         color[i] += clear + cover * (0.9 - clear) + glow
 
 
@@ -173,7 +173,7 @@ def _leave_out_sky(hits, points, count, origin):
     """Moves points in the sky, which receive no shadows, to another point of the tile or the camera."""
     x, y, z = origin[0], origin[1], origin[2]
     for k in range(count):
-        if hits[k] < 0 and hits[k] != GROUND:
+        if hits[k] < 0 and hits[k] != _GROUND:
             points[k, 0], points[k, 1], points[k, 2] = x, y, z
         else:
             x, y, z = points[k, 0], points[k, 1], points[k, 2]
@@ -185,7 +185,7 @@ def _shade(hit, t, p, d, footprint, parts, look, highlights, sky, shadowing, cou
     part_materials, wall_materials, materials, lights, ambient = look
     shallow = 0.15
     if sky is not None:
-        if hit < 0 and hit != GROUND:
+        if hit < 0 and hit != _GROUND:
             _add_sky(sky, d, footprint, color)
             return
         shallow = 0.03  # otherwise the far ground would flicker
@@ -236,7 +236,7 @@ def _cast_centers(tile, origin, rotation, camera, geometry, sky, seen, d, depth)
         for x in range(x0, x1):
             z = _ray(float(x), float(y), rotation, camera, d)
             t, hit = nearest_hit(visible, near, count, parts, walls, ox, oy, oz, d[0], d[1], d[2])
-            in_sky = sky is not None and hit < 0 and hit != GROUND
+            in_sky = sky is not None and hit < 0 and hit != _GROUND
             depth[y, x] = 0.0 if in_sky else t * z
 
 

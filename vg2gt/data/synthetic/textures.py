@@ -24,13 +24,13 @@ class Pattern(IntEnum):
     CLOUDS = 5
     WOOD = 6
     MOSAIC = 7
-    WEAVE = 8
+    _WEAVE = 8
     PLANKS = 9
     WINDOWS = 10
 
 
 INDOOR = tuple(pattern for pattern in Pattern if pattern is not Pattern.WINDOWS)
-PLAIN, STRIPES, CHECKS, BRICKS, DOTS, CLOUDS, WOOD, MOSAIC, WEAVE, PLANKS, WINDOWS = (int(kind) for kind in Pattern)
+PLAIN, STRIPES, CHECKS, BRICKS, DOTS, CLOUDS, WOOD, MOSAIC, _WEAVE, PLANKS, WINDOWS = (int(kind) for kind in Pattern)
 
 _MIN_WIDTH = 1e-4  # filter width below which a pattern counts as unfiltered
 
@@ -164,7 +164,7 @@ def pattern_value(kind, x, y, frequency, footprint, seed):
         value = _grain(x, y, frequency, footprint, seed)
     elif kind == MOSAIC:
         value = _blend_cells(u, v, seed, width)
-    elif kind == WEAVE:
+    elif kind == _WEAVE:
         value = 0.5 * pulse_train(u, 0.3, width) + 0.3 * pulse_train(v, 0.3, width)
         value += 0.2 * pulse_train(3 * u + 0.5, 0.15, 3 * width)
     elif kind == PLANKS:

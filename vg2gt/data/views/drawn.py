@@ -23,7 +23,7 @@ from vg2gt.io.files import read_json
 
 log = logging.getLogger(__name__)
 
-INDICES = Path(__file__).resolve().parent / "indices"
+_INDICES = Path(__file__).resolve().parent / "indices"
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ class ViewSelection:
 
 def index_path(name: str) -> Path:
     """Returns the file of an index, given the name of a packaged index or a path ending in ``.json``."""
-    return Path(name).expanduser() if name.endswith(".json") else INDICES / f"{name}.json"
+    return Path(name).expanduser() if name.endswith(".json") else _INDICES / f"{name}.json"
 
 
 def read_index(name: str | None) -> Mapping[str, Mapping[str, Any]]:
@@ -136,7 +136,7 @@ def read_index(name: str | None) -> Mapping[str, Mapping[str, Any]]:
         return {}
     path = index_path(name)
     if not path.is_file():
-        known = ", ".join(sorted(p.stem for p in INDICES.glob("*.json")))
+        known = ", ".join(sorted(p.stem for p in _INDICES.glob("*.json")))
         raise FileNotFoundError(
             f"evaluation.selection.index={name}: no file {path}; available: {known}; create others with "
             "`vg2gt data views`, or draw the views with evaluation.selection.index=null"

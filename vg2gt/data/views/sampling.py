@@ -155,7 +155,7 @@ def _block(seed: int, block: int, shares: tuple[int, ...]) -> np.ndarray:
     return np.random.default_rng((seed, _BLOCKS, block)).permutation(parts)
 
 
-def scene_pool(source: SceneSource, scenes: Sequence[str], seed: int = 0) -> ScenePool:
+def _scene_pool(source: SceneSource, scenes: Sequence[str], seed: int = 0) -> ScenePool:
     """Returns the scene sequence of training, with the parts of a mixture in proportion to their weights.
 
     Args:
@@ -251,7 +251,7 @@ class StepSampler(Sampler[tuple[SceneSample, ...]]):
     world_size: int = 1
 
     def __post_init__(self) -> None:
-        self.pool = scene_pool(self.source, self.scenes, self.views.seed)
+        self.pool = _scene_pool(self.source, self.scenes, self.views.seed)
 
     def __len__(self) -> int:
         return self.steps

@@ -20,12 +20,12 @@ from vg2gt.types import Cameras, Gaussians
 COUNT = 1000  # Gaussians on the full sphere
 RADIUS = 20.0  # median depths
 FAR = 8.0  # median depths; only the shell is this far from every camera
-BLUR = 1.5  # standard deviation of the colour blur, in spacings of the shell's Gaussians
-PRIOR = 3.0  # pixels of the mean colour added in every direction
+_BLUR = 1.5  # standard deviation of the colour blur, in spacings of the shell's Gaussians
+_PRIOR = 3.0  # pixels of the mean colour added in every direction
 WIDTH = 0.6  # standard deviation of each Gaussian in spacings; they overlap without gaps
 THIN = 0.02  # thickness relative to the width
 OPACITY = 0.95
-RAYS = 60_000  # pixels are subsampled to fewer than twice this number
+_RAYS = 60_000  # pixels are subsampled to fewer than twice this number
 LEAST = 0.005  # share of unsupported pixels below which there is no shell
 
 
@@ -47,16 +47,16 @@ def far_shell(images: Tensor, depth: Tensor, cameras: Cameras, mask: Tensor | No
         return None
     # world rays and colours of R pixels without depth: [R, 3]
     rows = missing.flatten().nonzero()[:, 0]
-    rows = rows[:: max(1, len(rows) // RAYS)]
+    rows = rows[:: max(1, len(rows) // _RAYS)]
     rays = ray_directions(cameras.intrinsics[0], cameras.size) @ cameras.world_to_camera[0, :, None, :3, :3]
     rays = F.normalize(rays.reshape(-1, 3)[rows], dim=-1)
     colors = images.movedim(1, -1).reshape(-1, 3)[rows]
     # mean colour of the rays around each of N directions
     directions = _fibonacci().to(rays)
     spacing = math.sqrt(4 * math.pi / COUNT)
-    total = PRIOR * F.pad(colors.mean(0, keepdim=True), (0, 1), value=1.0).repeat(COUNT, 1)  # [N, 4]
+    total = _PRIOR * F.pad(colors.mean(0, keepdim=True), (0, 1), value=1.0).repeat(COUNT, 1)  # [N, 4]
     for ray, color in zip(rays.split(4096), colors.split(4096), strict=True):
-        weight = torch.exp((ray @ directions.T - 1) / (BLUR * spacing) ** 2)
+        weight = torch.exp((ray @ directions.T - 1) / (_BLUR * spacing) ** 2)
         total += weight.T @ F.pad(color, (0, 1), value=1.0)
     centers, median = camera_centers(cameras)[0], depth[depth > 0].median()
     extent = (centers - centers.mean(0)).norm(dim=1).max()

@@ -11,12 +11,12 @@ from torch import Tensor
 from torch.nn import functional as F
 
 TOLERANCE = 0.015  # largest relative distance of a pixel from the plane through two neighbours on the same side
-STEEPEST = 0.12  # relative change of depth per pixel above which not even a plane counts as a surface
+_STEEPEST = 0.12  # relative change of depth per pixel above which not even a plane counts as a surface
 CONTRAST = 0.08  # relative depth range of a window below which there is no silhouette
-INSIDE = 0.05  # share of that range by which a pixel must lie behind the front and before the back
+_INSIDE = 0.05  # share of that range by which a pixel must lie behind the front and before the back
 REACH = 2  # pixels to each side, window of the depth range
 STEP = 0.15  # relative depth range around a pixel from which on it is next to a silhouette
-STEP_REACH = 3  # pixels to each side, window of STEP
+_STEP_REACH = 3  # pixels to each side, window of STEP
 
 
 def on_surface(depth: Tensor) -> Tensor:
@@ -43,9 +43,9 @@ def on_surface(depth: Tensor) -> Tensor:
         before, before2, after, after2 = (_shifted(inverse, axis, by) for by in (-1, -2, 1, 2))
         off_plane = torch.minimum((inverse - 2 * before + before2).abs(), (inverse - 2 * after + after2).abs())
         step = torch.minimum((inverse - before).abs(), (inverse - after).abs())
-        broken |= (off_plane > TOLERANCE * inverse) | (step > STEEPEST * inverse)
+        broken |= (off_plane > TOLERANCE * inverse) | (step > _STEEPEST * inverse)
     near, far = _depth_range(depth, REACH)
-    margin = INSIDE * (far - near)
+    margin = _INSIDE * (far - near)
     between = (far > (1 + CONTRAST) * near) & (depth > near + margin) & (depth < far - margin)
     return ~(broken & between)
 
@@ -59,7 +59,7 @@ def near_silhouettes(depth: Tensor) -> Tensor:
     Returns:
         ``[..., H, W]`` bool; false where the depth is invalid.
     """
-    near, far = _depth_range(depth, STEP_REACH)
+    near, far = _depth_range(depth, _STEP_REACH)
     return (depth > 0) & ((far >= (1 + STEP) * near) | ~on_surface(depth))
 
 

@@ -17,14 +17,14 @@ from vg2gt.types import Cameras
 
 CENTROID_CHANNELS = 3  # per voxel: centroid of its points in the cell
 SURFACE_CHANNELS = 5  # per point: vector to the surface in camera axes (3), change of depth (1), confidence (1)
-SURFACE_WIDTH = 2.0  # voxels; standard deviation of the Gaussian weights of the voxels around a point
-DEPTH_CHANGE_UNIT = 0.02  # relative to the depth
-MAX_DEPTH_CHANGE = 3.0  # in DEPTH_CHANGE_UNIT
+_SURFACE_WIDTH = 2.0  # voxels; standard deviation of the Gaussian weights of the voxels around a point
+_DEPTH_CHANGE_UNIT = 0.02  # relative to the depth
+_MAX_DEPTH_CHANGE = 3.0  # in _DEPTH_CHANGE_UNIT
 GRAZING = 0.2  # product of normal and ray below which the change of depth is unreliable
-NORMAL_EDGE = 0.2  # relative depth step across which no normal is computed
-GATE_OPEN = 0.4  # disagreement in DEPTH_CHANGE_UNIT at which the gate is 1
-GATE_POWER = 3.0
-GATE_MOST = 1.5  # largest gate
+_NORMAL_EDGE = 0.2  # relative depth step across which no normal is computed
+_GATE_OPEN = 0.4  # disagreement in _DEPTH_CHANGE_UNIT at which the gate is 1
+_GATE_POWER = 3.0
+_GATE_MOST = 1.5  # largest gate
 
 
 class PointFrames:
@@ -40,7 +40,7 @@ class PointFrames:
         height, width = depth.shape[-2:]
         self.depth = torch.where(depth > 0, depth, 1.0).flatten()[rows]
         self.ray = ray_directions(cameras.intrinsics, (height, width)).flatten(0, -2)[rows]
-        normals, known = normals_from_depth(depth, cameras.intrinsics, NORMAL_EDGE)  # [B, V, 3, h, w], [B, V, h, w]
+        normals, known = normals_from_depth(depth, cameras.intrinsics, _NORMAL_EDGE)  # [B, V, 3, h, w], [B, V, h, w]
         normals = torch.where(known[:, :, None], normals, normals.new_tensor([0.0, 0.0, -1.0])[:, None, None])
         self.normal = normals.permute(0, 1, 3, 4, 2).flatten(0, -2)[rows]
         self.rotation = cameras.world_to_camera[..., :3, :3].flatten(0, 1)[rows // (height * width)]
@@ -56,14 +56,14 @@ class PointFrames:
             voxel_size: ``[N]`` scene units per voxel.
 
         Returns:
-            ``[N, 4]``. The change is positive for a surface behind the point, in units of ``DEPTH_CHANGE_UNIT`` of the
-            depth, clamped to ``MAX_DEPTH_CHANGE`` of them, and 0 where the ray grazes the surface.
+            ``[N, 4]``. The change is positive for a surface behind the point, in units of ``_DEPTH_CHANGE_UNIT`` of the
+            depth, clamped to ``_MAX_DEPTH_CHANGE`` of them, and 0 where the ray grazes the surface.
         """
         local = (self.rotation @ to_surface[..., None])[..., 0]
         facing = (self.normal * self.ray).sum(-1)
         steps = (self.normal * local).sum(-1) / facing
-        change = steps * voxel_size / (self.depth * DEPTH_CHANGE_UNIT)
-        change = torch.where(facing < -GRAZING, change, 0.0).clamp(-MAX_DEPTH_CHANGE, MAX_DEPTH_CHANGE)
+        change = steps * voxel_size / (self.depth * _DEPTH_CHANGE_UNIT)
+        change = torch.where(facing < -GRAZING, change, 0.0).clamp(-_MAX_DEPTH_CHANGE, _MAX_DEPTH_CHANGE)
         return torch.cat((local, change[:, None]), -1)
 
 
@@ -71,7 +71,7 @@ def disagreement(change: Tensor, usable: Tensor, batch: Tensor, scenes: int) -> 
     """Returns the median absolute change of depth ``[B]`` over the usable points of each scene; 0 if there are none.
 
     Args:
-        change: ``[N]`` in units of ``DEPTH_CHANGE_UNIT``, as :meth:`PointFrames.in_camera` gives it.
+        change: ``[N]`` in units of ``_DEPTH_CHANGE_UNIT``, as :meth:`PointFrames.in_camera` gives it.
         usable: ``[N]`` bool.
         batch: ``[N]`` scene index, sorted.
         scenes: B.
@@ -86,7 +86,7 @@ def gate(disagreement: Tensor) -> Tensor:
 
     Its constants were chosen on six rooms and two recordings with 0 to 5 % noise (docs/results.md).
     """
-    return (disagreement / GATE_OPEN).pow(GATE_POWER).clamp(max=GATE_MOST)
+    return (disagreement / _GATE_OPEN).pow(_GATE_POWER).clamp(max=_GATE_MOST)
 
 
 def cell_centroids(cells: Tensor, confidence: Tensor, plan: VoxelPlan) -> Tensor:
@@ -118,6 +118,6 @@ def vectors_to_surface(queries: Tensor, centroids: Tensor, evidence: Tensor, ind
         index: ``[N, k]`` the neighbours' rows in ``centroids``.
     """
     offset = centroids[index] - queries[:, None]  # [N, k, 3]
-    weights = evidence * torch.exp(offset.square().sum(-1) / (-2 * SURFACE_WIDTH**2))  # [N, k]
+    weights = evidence * torch.exp(offset.square().sum(-1) / (-2 * _SURFACE_WIDTH**2))  # [N, k]
     weights = weights / weights.sum(1, keepdim=True).clamp(min=1e-12)
     return (weights[..., None] * offset).sum(1)

@@ -16,14 +16,14 @@ from torch.nn import functional as F
 from vg2gt.geometry.symmetric import principal_direction
 from vg2gt.types import TensorRecord, VoxelMoments
 
-UNIFORM_VARIANCE = 1 / 12  # cells^2; variance of points spread uniformly over a cell
-GRADIENT_RIDGE = 0.01 / 12  # cells^2; suppresses colour gradients of points that are closer together
-MIN_GRADIENT = 1e-4  # squared colour per squared cell; below it, the longest axis is the first axis of the frame
-SPACING = 1.2  # cells; n Gaussians in a row are SPACING / n apart
+_UNIFORM_VARIANCE = 1 / 12  # cells^2; variance of points spread uniformly over a cell
+_GRADIENT_RIDGE = 0.01 / 12  # cells^2; suppresses colour gradients of points that are closer together
+_MIN_GRADIENT = 1e-4  # squared colour per squared cell; below it, the longest axis is the first axis of the frame
+_SPACING = 1.2  # cells; n Gaussians in a row are _SPACING / n apart
 ALONE = 0.41  # cells; standard deviation of a single Gaussian in a row
 SHARED = 0.58  # cells; n Gaussians in a row have the standard deviation SHARED / n
 GRAZING = 0.2  # smallest cosine between line of sight and normal in the footprint of a pixel on the surface
-LARGEST_REACH = 1.2  # largest extent of the points, relative to a full cell
+_LARGEST_REACH = 1.2  # largest extent of the points, relative to a full cell
 MIN_REACH = 0.3  # smallest extent of the Gaussians, relative to a full cell, where a surface only touches the cell
 THICKNESS = 0.06  # cells; standard deviation along the normal
 COLOR_GAIN = 1.4  # factor on initial colour differences, since overlapping Gaussians blur their colours
@@ -78,14 +78,14 @@ def surface_frame(moments: VoxelMoments) -> tuple[Tensor, Tensor, Tensor]:
     tangent = _orthogonal(normal)
     plane = torch.stack((tangent, torch.linalg.cross(normal, tangent)), -1)  # [M, 3, 2]
     inside = plane.transpose(1, 2) @ spread @ plane  # [M, 2, 2]
-    ridge = inside + GRADIENT_RIDGE * torch.eye(2, dtype=spread.dtype, device=spread.device)
+    ridge = inside + _GRADIENT_RIDGE * torch.eye(2, dtype=spread.dtype, device=spread.device)
     determinant = ridge[:, 0, 0] * ridge[:, 1, 1] - ridge[:, 0, 1].square()
     adjugate = torch.stack((ridge[:, 1, 1], -ridge[:, 0, 1], -ridge[:, 0, 1], ridge[:, 0, 0]), -1).unflatten(-1, (2, 2))
     slope = adjugate @ (plane.transpose(1, 2) @ cross) / determinant[:, None, None]  # [M, 2, 3]: least squares
     change = slope @ slope.transpose(1, 2)
     along, strength = principal_direction(change[:, 0, 0], change[:, 0, 1], change[:, 1, 1])
     longest, _ = principal_direction(inside[:, 0, 0], inside[:, 0, 1], inside[:, 1, 1])
-    along = torch.where((strength > MIN_GRADIENT)[:, None], along, longest)
+    along = torch.where((strength > _MIN_GRADIENT)[:, None], along, longest)
     darker = (slope.sum(-1) * along).sum(-1, keepdim=True) < 0
     along = torch.where(darker, -along, along)
     across = torch.stack((-along[:, 1], along[:, 0]), -1)
@@ -94,8 +94,8 @@ def surface_frame(moments: VoxelMoments) -> tuple[Tensor, Tensor, Tensor]:
     # add the footprint of a point's pixel, which grows as the surface tilts away from the line of sight
     sight = (frame.transpose(1, 2) @ facing[:, :, None])[..., 0]  # [M, 3], of unit length
     lean = sight[:, :2].square() / sight[:, 2:].clamp(min=GRAZING).square()
-    variance = (axes * (inside @ axes)).sum(1) + (1 + lean) * moments.pixel[:, None].square() * UNIFORM_VARIANCE
-    reach = (variance / UNIFORM_VARIANCE).clamp(0, LARGEST_REACH**2).sqrt()  # [M, 2]
+    variance = (axes * (inside @ axes)).sum(1) + (1 + lean) * moments.pixel[:, None].square() * _UNIFORM_VARIANCE
+    reach = (variance / _UNIFORM_VARIANCE).clamp(0, _LARGEST_REACH**2).sqrt()  # [M, 2]
     return frame, plane @ slope, reach
 
 
@@ -105,9 +105,9 @@ def layout(splits: int, like: Tensor) -> tuple[Tensor, Tensor]:
     places, scales = [], []
     for row in range(rows):
         count = splits // rows + (row < splits % rows)
-        across = (row - (rows - 1) / 2) * SPACING / rows
+        across = (row - (rows - 1) / 2) * _SPACING / rows
         for number in range(count):
-            places.append(((number - (count - 1) / 2) * SPACING / count, across))
+            places.append(((number - (count - 1) / 2) * _SPACING / count, across))
             scales.append((_width(count), _width(rows), THICKNESS))
     return like.new_tensor(places), like.new_tensor(scales)
 

@@ -21,8 +21,8 @@ from vg2gt.types import Cameras
 from vg2gt.visibility.counts import count_views
 
 PARAMETERS = 7  # per window: log scale, rotation vector, translation
-OUTLIER = 0.1  # residual (relative, rad, window depths) beyond which an edge is down-weighted
-CONTRADICTS = 0.25  # residual from which a loop is rejected
+_OUTLIER = 0.1  # residual (relative, rad, window depths) beyond which an edge is down-weighted
+_CONTRADICTS = 0.25  # residual from which a loop is rejected
 AGREE = 0.1  # share of a loop's pixels that must agree with its other part
 TOLERANCE, MARGIN = 0.05, 0.1  # relative depth differences of that check: agreement, looking through
 ROUNDS = 50  # maximum function evaluations of the pose graph's solver
@@ -76,7 +76,7 @@ def place_windows(windows: Sequence[Found], loops: Sequence[Found] = ()) -> list
     for loop in loops:
         more = [*edges, *_edges(nodes, loop)]
         tried, largest = _solved([*nodes, loop], more, _chained(more, poses, len(nodes) + 1))
-        if largest < CONTRADICTS:
+        if largest < _CONTRADICTS:
             poses, edges = tried, more
             nodes.append(loop)
     rotations = Rotation.from_rotvec(poses[:, 1:4]).as_matrix()
@@ -101,7 +101,7 @@ def _solved(
         return np.column_stack((wanted[:, 0] - poses[a, 0], turn, (wanted[:, 4:] - poses[a, 4:]) / lengths))
 
     result = least_squares(
-        lambda flat: misfits(flat).ravel() / OUTLIER,
+        lambda flat: misfits(flat).ravel() / _OUTLIER,
         start[1:].ravel(),
         loss="soft_l1",
         x_scale="jac",

@@ -32,8 +32,8 @@ from vg2gt.visibility import Status, pixel_evidence
 from vg2gt.visibility.check import choose_partners
 
 TOKEN_BYTES = 4e9  # maximum size of all windows' tokens on disk; if larger, the backbone runs a second time instead
-REDUCED = 4  # pixel stride of the depth that places windows
-MEDIAN_OF = 1 << 24  # maximum number of depths in a median
+_REDUCED = 4  # pixel stride of the depth that places windows
+_MEDIAN_OF = 1 << 24  # maximum number of depths in a median
 
 
 def window_model(model: Reconstructor) -> VG2GT:
@@ -267,7 +267,7 @@ class WindowRun:
 def _summary(views: Tensor, tokens: Tokens, geometry: Geometry) -> dict[str, Tensor]:
     """Returns what places a window: cameras, reduced depth, metres per unit, and a descriptor of each view."""
     shallow, cameras = tokens.patch[0][0].float(), geometry.cameras
-    reduced = geometry.depth[0, :, REDUCED // 2 :: REDUCED, REDUCED // 2 :: REDUCED]
+    reduced = geometry.depth[0, :, _REDUCED // 2 :: _REDUCED, _REDUCED // 2 :: _REDUCED]
     found = {
         "views": views,
         "poses": cameras.world_to_camera,
@@ -282,13 +282,13 @@ def _summary(views: Tensor, tokens: Tokens, geometry: Geometry) -> dict[str, Ten
 def found_of(known: dict[str, Tensor]) -> Found:
     """Returns a window's cameras and reduced depth from its summary."""
     size = (known["depth"].shape[1], known["depth"].shape[2])
-    sampled = strided_intrinsics(known["intrinsics"], REDUCED, REDUCED)
+    sampled = strided_intrinsics(known["intrinsics"], _REDUCED, _REDUCED)
     return Found(known["views"], Cameras(known["poses"], sampled, size), known["depth"], known["intrinsics"])
 
 
 def _sampled(geometry: Geometry) -> Geometry:
     """Subsamples geometry evenly, if it has too many depths for a median."""
     step = 1
-    while geometry.depth.numel() // step**2 > MEDIAN_OF:
+    while geometry.depth.numel() // step**2 > _MEDIAN_OF:
         step += 1
     return replace(geometry, depth=geometry.depth[..., step // 2 :: step, step // 2 :: step])

@@ -34,7 +34,7 @@ from vg2gt.types import Cameras, Hints
 
 FORMAT = 3
 """Version of the folder's format; increment it when the format changes."""
-SET = "set.json"  # marks the folder of a set
+_SET = "set.json"  # marks the folder of a set
 ROWS = 400_000  # voxels merged at a time
 AUTOMATIC = 100  # number of views above which a capture is processed in windows
 SIZE = 24  # own views per window
@@ -53,8 +53,8 @@ class WindowStore:
 
     def __init__(self, folder: Path, key: str) -> None:
         self.folder = folder / key[:12]
-        if not (self.folder / SET).is_file():
-            write_json(self.folder / SET, {})
+        if not (self.folder / _SET).is_file():
+            write_json(self.folder / _SET, {})
 
     def array(self, name: str, shape: Sequence[int] | None = None, fill: float = 0) -> Tensor:
         """Returns a memory-mapped float32 array of the folder; writing to the tensor writes to the file.
@@ -167,7 +167,7 @@ def _read_rows(file: Path, rows: slice) -> dict[str, Tensor]:
 
 def remove(folder: Path, but: Path | None = None) -> None:
     """Removes all sets of a folder, except for that in the folder ``but``; also the folder if it is empty then."""
-    sets = [file.parent for file in folder.glob(f"*/{SET}") if file.parent != but]
+    sets = [file.parent for file in folder.glob(f"*/{_SET}") if file.parent != but]
     for place in sets:
         shutil.rmtree(place)
     if sets and not any(folder.iterdir()):

@@ -17,9 +17,9 @@ from vg2gt.rendering.cpu.projection import BLOCK, rotation, whiten
 
 CHUNK = 64  # Gaussians processed at a time
 FIELDS = 52  # arrays of CHUNK values that the chain reads and writes
-MEAN, QUAT, SCALE, ROW = (np.uintp(j * CHUNK) for j in (0, 3, 7, 10))
-GRAD_MEAN, GRAD_QUAT, GRAD_SCALE, CAMERA = (np.uintp(j * CHUNK) for j in (26, 29, 33, 36))
-VECTOR = 8  # the chain's loop length is a multiple of this, so that no scalar remainder loop is left
+MEAN, _QUAT, SCALE, ROW = (np.uintp(j * CHUNK) for j in (0, 3, 7, 10))
+_GRAD_MEAN, _GRAD_QUAT, _GRAD_SCALE, CAMERA = (np.uintp(j * CHUNK) for j in (26, 29, 33, 36))
+_VECTOR = 8  # the chain's loop length is a multiple of this, so that no scalar remainder loop is left
 
 
 @kernel_part(fastmath=FAST, error_model="numpy", forceinline=True)
@@ -61,7 +61,7 @@ def _gather(begin, end, means, quats, scales, counts, offsets, rows, total, work
             work[MEAN + np.uintp(j * CHUNK) + c] = means[i, j]
             work[SCALE + np.uintp(j * CHUNK) + c] = scales[i, j]
         for j in range(4):
-            work[QUAT + np.uintp(j * CHUNK) + c] = quats[i, j]
+            work[_QUAT + np.uintp(j * CHUNK) + c] = quats[i, j]
         indices[found] = i
         found += 1
     return found
@@ -89,7 +89,7 @@ def _chain(work, count, pose, fx, fy, x_limit, y_limit, lowpass, solid):
     w10, w11, w12, t1 = pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3]
     w20, w21, w22, t2 = pose[2, 0], pose[2, 1], pose[2, 2], pose[2, 3]
     ifx, ify = 1 / fx, 1 / fy
-    for lane in range(-(-count // VECTOR) * VECTOR):
+    for lane in range(-(-count // _VECTOR) * _VECTOR):
         c = np.uintp(lane)
         mx, my, mz = work[MEAN + c], work[MEAN + CHUNK + c], work[MEAN + 2 * CHUNK + c]
         row0, row1, row2 = work[ROW + c], work[ROW + CHUNK + c], work[ROW + 2 * CHUNK + c]
@@ -101,7 +101,12 @@ def _chain(work, count, pose, fx, fy, x_limit, y_limit, lowpass, solid):
         u = (w00 * mx + w01 * my + w02 * mz + t0) * iz
         v = (w10 * mx + w11 * my + w12 * mz + t1) * iz
         us, vs = min(max(u, -x_limit), x_limit), min(max(v, -y_limit), y_limit)
-        qw, qx, qy, qz = work[QUAT + c], work[QUAT + CHUNK + c], work[QUAT + 2 * CHUNK + c], work[QUAT + 3 * CHUNK + c]
+        qw, qx, qy, qz = (
+            work[_QUAT + c],
+            work[_QUAT + CHUNK + c],
+            work[_QUAT + 2 * CHUNK + c],
+            work[_QUAT + 3 * CHUNK + c],
+        )
         norm = 1 / math.sqrt(qw * qw + qx * qx + qy * qy + qz * qz)
         qw, qx, qy, qz = qw * norm, qx * norm, qy * norm, qz * norm
         r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation(qw, qx, qy, qz)
@@ -162,10 +167,10 @@ def _chain(work, count, pose, fx, fy, x_limit, y_limit, lowpass, solid):
         gv += (gvs0 + gvs1 + gvs2) if abs(v) < y_limit else 0.0
         gz -= (gjx + gjy + gu * u + gv * v) * iz
         gx, gy = gu * iz, gv * iz
-        work[GRAD_MEAN + c] = w00 * gx + w10 * gy + w20 * gz
-        work[GRAD_MEAN + CHUNK + c] = w01 * gx + w11 * gy + w21 * gz
-        work[GRAD_MEAN + 2 * CHUNK + c] = w02 * gx + w12 * gy + w22 * gz
-        work[GRAD_SCALE + c], work[GRAD_SCALE + CHUNK + c], work[GRAD_SCALE + 2 * CHUNK + c] = gs0, gs1, gs2
+        work[_GRAD_MEAN + c] = w00 * gx + w10 * gy + w20 * gz
+        work[_GRAD_MEAN + CHUNK + c] = w01 * gx + w11 * gy + w21 * gz
+        work[_GRAD_MEAN + 2 * CHUNK + c] = w02 * gx + w12 * gy + w22 * gz
+        work[_GRAD_SCALE + c], work[_GRAD_SCALE + CHUNK + c], work[_GRAD_SCALE + 2 * CHUNK + c] = gs0, gs1, gs2
         # pose: through the mean, and through the axes (pose rotation times Gaussian rotation)
         work[CAMERA + c] = gx * mx + a00 * r00 + a01 * r01 + a02 * r02
         work[CAMERA + CHUNK + c] = gx * my + a00 * r10 + a01 * r11 + a02 * r12
@@ -197,10 +202,10 @@ def _chain(work, count, pose, fx, fy, x_limit, y_limit, lowpass, solid):
         gqy = 2 * (qx * (d01 + d10) + qz * (d12 + d21) - 2 * qy * (d00 + d22) + qw * (d02 - d20))
         gqz = 2 * (qx * (d02 + d20) + qy * (d12 + d21) - 2 * qz * (d00 + d11) + qw * (d10 - d01))
         radial = gqw * qw + gqx * qx + gqy * qy + gqz * qz
-        work[GRAD_QUAT + c] = (gqw - qw * radial) * norm
-        work[GRAD_QUAT + CHUNK + c] = (gqx - qx * radial) * norm
-        work[GRAD_QUAT + 2 * CHUNK + c] = (gqy - qy * radial) * norm
-        work[GRAD_QUAT + 3 * CHUNK + c] = (gqz - qz * radial) * norm
+        work[_GRAD_QUAT + c] = (gqw - qw * radial) * norm
+        work[_GRAD_QUAT + CHUNK + c] = (gqx - qx * radial) * norm
+        work[_GRAD_QUAT + 2 * CHUNK + c] = (gqy - qy * radial) * norm
+        work[_GRAD_QUAT + 3 * CHUNK + c] = (gqz - qz * radial) * norm
 
 
 @kernel_part(fastmath=FAST, error_model="numpy")
@@ -211,11 +216,11 @@ def _scatter(
     for found in range(count):
         c, i = np.uintp(found), indices[found]
         for j in range(3):
-            grad_means[i, j] += work[GRAD_MEAN + np.uintp(j * CHUNK) + c]
-            grad_scales[i, j] += work[GRAD_SCALE + np.uintp(j * CHUNK) + c]
+            grad_means[i, j] += work[_GRAD_MEAN + np.uintp(j * CHUNK) + c]
+            grad_scales[i, j] += work[_GRAD_SCALE + np.uintp(j * CHUNK) + c]
             grad_colors[color_view, i, j] += work[ROW + np.uintp((10 + j) * CHUNK) + c]
         for j in range(4):
-            grad_quats[i, j] += work[GRAD_QUAT + np.uintp(j * CHUNK) + c]
+            grad_quats[i, j] += work[_GRAD_QUAT + np.uintp(j * CHUNK) + c]
         grad_opacities[i] += work[ROW + np.uintp(9 * CHUNK) + c]
         for j in range(16):
             camera[j] += work[CAMERA + np.uintp(j * CHUNK) + c]

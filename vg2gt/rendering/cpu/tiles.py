@@ -13,8 +13,8 @@ from vg2gt.kernels.compiled import kernel, kernel_part
 from vg2gt.kernels.compiled_math import exp
 from vg2gt.rendering.constants import FAST, ONE, ZERO
 
-TILE_BITS = 4  # tiles are 16 pixels wide and high
-TILE = 1 << TILE_BITS
+_TILE_BITS = 4  # tiles are 16 pixels wide and high
+TILE = 1 << _TILE_BITS
 SIDE = 4  # a block of SIDE x SIDE rays is one vector operation
 BLOCKS_ACROSS = TILE // SIDE
 BLOCKS = BLOCKS_ACROSS**2
@@ -24,7 +24,7 @@ PLANE = TILE * TILE
 PLANES = 17  # planes of a tile's state
 SUMS_ROWS = 20  # gradient sums of one Gaussian, LANES values each
 HIT_SIZE = 3 * LANES  # one hit of each of a block's rays: alpha, peak, precision
-FIRST_COLUMN = sum(1 << row * BLOCKS_ACROSS for row in range(BLOCKS_ACROSS))  # bit mask of blocks
+_FIRST_COLUMN = sum(1 << row * BLOCKS_ACROSS for row in range(BLOCKS_ACROSS))  # bit mask of blocks
 STAGED = 16  # Gaussians copied at a time, with their colours
 RECORD = 16  # projected Gaussian: centre 2, conic 3, tilt 2, z, a0, eps, opacity, cutoff, normal 3, unused
 ROW = 16  # gradient of one (tile, Gaussian): centre 2, conic 3, tilt 2, z, a0, opacity, colour 3, normal 3
@@ -110,7 +110,7 @@ def find_blocks(boxes, members, x_tile, y_tile, touched):
         i = np.uintp(members[j])
         x0, x1 = _touched(boxes[i, 0] - x_tile, boxes[i, 1] - x_tile)
         y0, y1 = _touched(boxes[i, 2] - y_tile, boxes[i, 3] - y_tile)
-        lines = FIRST_COLUMN & ((1 << y1 * BLOCKS_ACROSS) - (1 << y0 * BLOCKS_ACROSS))
+        lines = _FIRST_COLUMN & ((1 << y1 * BLOCKS_ACROSS) - (1 << y0 * BLOCKS_ACROSS))
         touched[j] = lines * ((1 << x1) - (1 << x0))
 
 
@@ -167,8 +167,8 @@ def count_tiles(boxes, across, counts, offsets, starts):
         counts[i], offsets[i] = 0, total
         if boxes[i, 1] <= boxes[i, 0]:
             continue
-        x0, x1 = boxes[i, 0] >> TILE_BITS, (boxes[i, 1] - 1) >> TILE_BITS
-        y0, y1 = boxes[i, 2] >> TILE_BITS, (boxes[i, 3] - 1) >> TILE_BITS
+        x0, x1 = boxes[i, 0] >> _TILE_BITS, (boxes[i, 1] - 1) >> _TILE_BITS
+        y0, y1 = boxes[i, 2] >> _TILE_BITS, (boxes[i, 3] - 1) >> _TILE_BITS
         for y in range(y0, y1 + 1):
             for x in range(x0, x1 + 1):
                 starts[y * across + x + 1] += 1
@@ -183,8 +183,8 @@ def fill_tiles(boxes, visible, across, offsets, ends, members, places):
     """Writes the tile lists, front to back, and the gradient row of each entry; ``ends`` begin as a copy of starts."""
     for i in visible:
         place = offsets[i]
-        x0, x1 = boxes[i, 0] >> TILE_BITS, (boxes[i, 1] - 1) >> TILE_BITS
-        y0, y1 = boxes[i, 2] >> TILE_BITS, (boxes[i, 3] - 1) >> TILE_BITS
+        x0, x1 = boxes[i, 0] >> _TILE_BITS, (boxes[i, 1] - 1) >> _TILE_BITS
+        y0, y1 = boxes[i, 2] >> _TILE_BITS, (boxes[i, 3] - 1) >> _TILE_BITS
         for y in range(y0, y1 + 1):
             for x in range(x0, x1 + 1):
                 position = ends[y * across + x]
