@@ -43,7 +43,7 @@ class Monitor:
         self._progress = Progress(
             TextColumn("{task.description:<24}"),
             BarColumn(24),
-            TextColumn("{task.completed:.0f}/{task.total:.0f}{task.fields[unit]}"),
+            TextColumn("{task.completed:.0f}{task.fields[unit]}"),
             TimeElapsedColumn(),
             TimeRemainingColumn(),
             console=Console(stderr=True),
@@ -67,7 +67,7 @@ class Monitor:
 
     @contextmanager
     def stage(self, name: str, total: int = 1, unit: str = "") -> Iterator[Callable[..., None]]:
-        """Measures the block; ``unit`` is shown after the number of steps.
+        """Measures the block; ``unit`` is shown after the number of steps, by default their total.
 
         Yields:
             A function to call after each of ``total`` steps, or with the number of steps done and a note to show.
@@ -75,7 +75,7 @@ class Monitor:
         self._settle()
         self._running.append(name)
         self.seconds.setdefault(name, 0.0)
-        task = self._progress.add_task(name, total=total, unit=unit)
+        task = self._progress.add_task(name, total=total, unit=unit or f"/{total}")
 
         def advance(done: float | None = None, note: str = "") -> None:
             if done is None:

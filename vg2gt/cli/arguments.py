@@ -99,7 +99,13 @@ def add_common_flags(add: Callable[..., Any], saved: Sequence[str], outputs: Map
     names = "files to write, separated by commas; --save help lists all"
     add("--save", type=_saved(outputs), default=list(saved), metavar="LIST", help=f"{names}; default: "
         + ", ".join(saved))  # fmt: skip
-    add("--mode", choices=MODES, default=MODES[0], metavar="MODE", help="how to render: solid (default) or rasterized")
+    add(
+        "--mode",
+        choices=MODES,
+        default=MODES[0],
+        metavar="MODE",
+        help="rendering: solid (default) or rasterized (as 3DGS)",
+    )
     add("--device", default="auto", metavar="NAME", help="auto (default), cpu, cuda or cuda:N")
     add("--overwrite", action="store_true", help="replace existing outputs")
     add("--quiet", action="store_true", help="show no progress bars")

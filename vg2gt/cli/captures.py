@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _PLACE, _PLAN, _RESULT, TABLE = "captures", "plan.json", "capture.json", "captures.md"
-FREE = ("images", "out", "overwrite", "quiet", "watch", "device")  # may differ when the command is given again
+_MAY_DIFFER = ("images", "out", "overwrite", "quiet", "watch", "device")  # may differ when the command is given again
 STARTED, _DONE, _FAILED = "started", "done", "failed"
 
 
@@ -128,7 +128,7 @@ def _refuse_other(path: Path, options: dict[str, Any]) -> None:
     """Raises FileExistsError if the plan in a folder has other options."""
     now = json.loads(json.dumps(options))  # lists for tuples
     before = read_json(path)["options"] if path.is_file() else now
-    if other := [name for name, value in now.items() if name not in FREE and value != before.get(name)]:
+    if other := [name for name, value in now.items() if name not in _MAY_DIFFER and value != before.get(name)]:
         raise FileExistsError(
             f"{path.parent.parent} holds captures made with other options ({', '.join(other)}): repeat them, choose "
             "another --out, or replace all with --overwrite"

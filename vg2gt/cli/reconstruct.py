@@ -68,7 +68,7 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument_group("model").add_argument
     add("--ckpt", metavar="PATH", help="a checkpoint or a run's folder; default: the weights in the package for "
         "backend=sweep, an untrained head for others")  # fmt: skip
-    add("--calibration", metavar="FILE", help="calibration of the stated errors; default: next to the checkpoint")
+    add("--calibration", metavar="FILE", help="depth errors by vg2gt calibrate; default: next to the checkpoint")
     add = parser.add_argument_group("refinement of up to 100 photographs, on by default").add_argument
     add("--quality", choices=("draft", "normal", "high"), default="normal", metavar="NAME", help="draft (working size "
         "only), normal (default: then at the photographs' own size) or high (with six times the steps)")  # fmt: skip
@@ -76,7 +76,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--watch", action="store_true", help=WATCH)
     add = parser.add_argument_group("what to keep").add_argument
     add("--object", action="store_true", help="only the object that the cameras look at")
-    add("--min-confidence", type=float, metavar="C", help="only Gaussians with a depth error bound up to 1 - C")
+    add("--min-confidence", type=float, metavar="C", help="only Gaussians whose depth error is at most 1 - C")
     add("--drop", type=list_of_names, default=[], metavar="LIST", help="no Gaussians with these statuses: guessed, "
         "contradicted, single (seen by one view), unseen")  # fmt: skip
     add = parser.add_argument_group("output").add_argument

@@ -40,8 +40,17 @@ from vg2gt.runs.pretrained import MODELS
 log = logging.getLogger(__name__)
 
 # Settings of samples, pictures and folders. All others affect the metrics and must be the same within a folder.
-FREE = ("views", "name", "output_dir", "overwrite", "ckpt", "device", "evaluation.pictures", "data.eval_scenes")
-FREE += ("data.workers", "data.memory_mb", "data.steps_per_epoch")
+_NOT_COMPARED = (
+    "views",
+    "name",
+    "output_dir",
+    "overwrite",
+    "ckpt",
+    "device",
+    "evaluation.pictures",
+    "data.eval_scenes",
+)
+_NOT_COMPARED += ("data.workers", "data.memory_mb", "data.steps_per_epoch")
 _REFINEMENT = ("refine.", "evaluation.refine")  # have no effect without refinement
 
 IDENTITY = "identity.json"
@@ -152,7 +161,7 @@ def _identity(
 ) -> dict[str, Any]:
     """All settings that affect the metrics of a sample, flattened; the device affects times."""
     settings = flatten(OmegaConf.to_container(config, resolve=True))
-    free = FREE if config.evaluation.refine else (*FREE, *_REFINEMENT)
+    free = _NOT_COMPARED if config.evaluation.refine else (*_NOT_COMPARED, *_REFINEMENT)
     kept = {key: value for key, value in settings.items() if not key.startswith(free)}
     kept |= {f"weights.{key}": value for key, value in model.backend.identity().items()}
     where = torch.cuda.get_device_name(device) if device.type == "cuda" else device.type

@@ -1,7 +1,8 @@
 """Precision policy of training, evaluation and reconstruction: networks in bfloat16 on a GPU, all else in float32.
 
 TF32 stays off for matrix products: it is a switch for the whole process, and would round those of geometry. cuDNN's
-convolutions in float32, such as those of the depth heads, use it: torch's default.
+convolutions in float32, such as those of the depth heads, use it: torch's default. If a new torch changes that, set
+``torch.backends.cudnn.allow_tf32``.
 """
 
 from __future__ import annotations

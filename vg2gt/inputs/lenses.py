@@ -67,7 +67,7 @@ def with_right_lenses(database: Path, lenses: Lenses, mapped: Mapped) -> Found:
             database, partial(mapped, _free(lenses), False), lambda models: _extent(models) >= _extent(found[1])
         )
     ):
-        log.warning("the focal lengths of the EXIF data do not fit the images (are they cropped?) and do not count")
+        log.warning("the focal lengths of the EXIF data do not fit the images (are they cropped?) and are not used")
         lenses, found = _free(lenses), other
     if not found[1]:
         return found

@@ -226,7 +226,7 @@ def _place(cameras: Cameras, frame: SceneFrame, pictures: Sequence[Picture]) -> 
         return None
     positions = np.array([(np.nan,) * 3 if each is None else each for each in found])
     if no_altitude := int(np.isfinite(positions[:, 0]).sum() - np.isfinite(positions).all(1).sum()):
-        log.warning("the GPS positions of %d photographs have no altitude and do not count", no_altitude)
+        log.warning("the GPS positions of %d photographs have no altitude and are not used", no_altitude)
     centers = camera_centers(cameras)[0].detach().cpu().double().numpy()
     place = fit_place(centers @ frame.to_source[:3, :3].T + frame.to_source[:3, 3], positions)
     if place is None:
@@ -234,7 +234,7 @@ def _place(cameras: Cameras, frame: SceneFrame, pictures: Sequence[Picture]) -> 
         return None
     if _upside_down(cameras, frame, place):
         log.warning(
-            "the GPS positions of the photographs do not count: by them, the photographs are upside down; are latitude "
+            "the GPS positions of the photographs are not used: by them, the photographs are upside down; are latitude "
             "and longitude swapped, or is east written for west?"
         )
         return None

@@ -200,7 +200,7 @@ def trust_lines(scene: Scene) -> list[str]:
     rest = [f"{100 * shares[name]:.0f} % {said}" for name, said in _DOUBTS.items() if shares[name] >= 0.005]
     lines = [f"Gaussians: {100 * shares['agreed']:.0f} % are confirmed by two or more views"]
     if rest:
-        lines[0] += f"; {', '.join(rest)}; --drop removes what you name"
+        lines[0] += f"; {', '.join(rest)}; remove some by --drop LIST"
     if shares["agreed"] < _FEW:
         given = CameraSource.of(scene.cameras_from) is CameraSource.GIVEN
         lines.append(f"few views agree: take more photographs in smaller steps{_GIVEN if given else ''}")

@@ -116,7 +116,7 @@ def load_model(
         raise (cause if known else ValueError(str(error))) from error
     weights = load_weights(built, checkpoint)
     if checkpoint is None and built.trained_parameters():
-        log.warning("no checkpoint: the head is untrained and produces coloured voxels (set ckpt for a trained one)")
+        log.warning("no trained weights for this backend: the scene is coloured voxels (ckpt names a checkpoint)")
     known = find_calibration(built, weights)
     return LoadedModel(built, replace(renderer, mode="solid", depth="median"), weights, known)
 
