@@ -58,6 +58,19 @@ def check_choice(name: str, value: object, choices: Any) -> None:
         raise ValueError(f"{name} is {value!r}; choose one of {', '.join(known)}")
 
 
+def check_ranges(options: object, prefix: str, *ranges: tuple[str, bool, str]) -> None:
+    """Raises ValueError, naming the option and its value, unless all are in range.
+
+    Args:
+        options: holds the options as attributes.
+        prefix: put before the names, such as ``refine.``.
+        ranges: name of an option, whether it is in range, and the range in words.
+    """
+    for name, good, expected in ranges:
+        if not good:
+            raise ValueError(f"{prefix}{name} must be {expected}, got {getattr(options, name)}")
+
+
 @dataclass(frozen=True)
 class Cameras(TensorRecord):
     """Pinhole cameras of B scenes with V views each.

@@ -12,7 +12,7 @@ from torch import Tensor
 from vg2gt.geometry.normals import normals_from_depth
 from vg2gt.geometry.spherical_harmonics import MAX_DEGREE
 from vg2gt.losses.gaussian import normal_error, structure_loss, weighted_mean
-from vg2gt.types import Cameras, Gaussians, Render, TensorRecord
+from vg2gt.types import Cameras, Gaussians, Render, TensorRecord, check_ranges
 
 if TYPE_CHECKING:
     from vg2gt.refinement.parameters import RefinedScene
@@ -250,7 +250,9 @@ class FullSizeOptions:
     ssim: float = 2.0
 
     def __post_init__(self) -> None:
-        for name, good, expected in (
+        check_ranges(
+            self,
+            "refine.full.",
             ("size", self.size >= _MIN_CROP, f"at least {_MIN_CROP}"),
             ("steps", self.steps >= 1, "at least 1"),
             ("renderings", self.renderings > 0, "positive"),
@@ -268,9 +270,7 @@ class FullSizeOptions:
             ("geometry_every", self.geometry_every >= 1, "at least 1"),
             ("sh_degree", self.sh_degree is None or 0 <= self.sh_degree <= MAX_DEGREE, f"0 to {MAX_DEGREE}, or null"),
             ("ssim", self.ssim >= 0, "at least 0"),
-        ):
-            if not good:
-                raise ValueError(f"refine.full.{name} must be {expected}, got {getattr(self, name)}")
+        )
 
 
 @dataclass(frozen=True)
@@ -319,7 +319,9 @@ class RefineOptions:
 
     def __post_init__(self) -> None:
         colored = self.loss.color_l1 + self.loss.ssim > 0
-        for name, good, expected in (
+        check_ranges(
+            self,
+            "refine.",
             ("steps", self.steps is None or self.steps >= 1, "at least 1, or null"),
             ("seconds", self.seconds is None or self.seconds > 0, "positive, or null"),
             ("check_every", self.check_every >= 1, "at least 1"),
@@ -331,9 +333,7 @@ class RefineOptions:
             ("geometry_every", self.geometry_every >= 1, "at least 1"),
             ("geometry_every", colored or self.geometry_every == 1, "1 without a term of colour, which scores states"),
             ("full", colored or self.full is None, "null without a term of colour, which most of its steps need"),
-        ):
-            if not good:
-                raise ValueError(f"refine.{name} must be {expected}, got {getattr(self, name)}")
+        )
 
     def of(self, views: int) -> RefineOptions:
         """Returns the options for this number of trained views, with ``steps`` set if they have no end."""

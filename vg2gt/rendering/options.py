@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from vg2gt.types import check_choice
+from vg2gt.types import check_choice, check_ranges
 
 Mode = Literal["solid", "rasterized"]
 DepthKind = Literal["median", "expected"]
@@ -58,16 +58,16 @@ class RenderOptions:
         check_choice("depth", self.depth, DepthKind)
         if self.mode == "solid" and self.depth != "median":
             raise ValueError("solid rendering has median depth only; use depth=median or mode=rasterized")
-        for name, good, expected in (
+        check_ranges(
+            self,
+            "",
             ("near", self.near > 0, "positive"),
             ("lowpass", self.lowpass >= 0, "at least 0"),
             ("alpha_max", 0 < self.alpha_max < 1, "between 0 and 1"),
             ("slope_floor", self.slope_floor >= 0, "at least 0"),
             ("bisections", self.bisections >= 1, "at least 1"),
             ("newton_steps", self.newton_steps >= 0, "at least 0"),
-        ):
-            if not good:
-                raise ValueError(f"{name} must be {expected}, got {getattr(self, name)}")
+        )
 
     @property
     def search_steps(self) -> int:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from vg2gt.geometry.cameras import compose, focal_lengths, invert_rigid, strided_intrinsics, unproject
-from vg2gt.types import Cameras, Geometry, TensorRecord
+from vg2gt.types import Cameras, Geometry, TensorRecord, check_ranges
 from vg2gt.visibility.counts import count_views, depth_ratio
 
 STRIDE = 4  # pixels between samples of the disagreement, along each axis
@@ -74,7 +74,9 @@ class ViewCheck:
     moved_margin: float = 0.08
 
     def __post_init__(self) -> None:
-        for name, good, expected in (
+        check_ranges(
+            self,
+            "model.visibility.",
             ("tolerance", self.tolerance > 0, "positive"),
             ("margin", self.tolerance <= self.margin < 1, "at least the tolerance and below 1"),
             ("rounds", self.rounds >= 1, "at least 1"),
@@ -83,9 +85,7 @@ class ViewCheck:
             ("coarsest", self.coarsest >= 1, "at least 1"),
             ("moment", self.moment is None or self.moment >= LEAST, f"at least {LEAST}, or null"),
             ("moved_margin", self.tolerance <= self.moved_margin < 1, "at least the tolerance and below 1"),
-        ):
-            if not good:
-                raise ValueError(f"model.visibility.{name} must be {expected}, got {getattr(self, name)}")
+        )
 
     @torch.no_grad()
     def __call__(self, geometry: Geometry, frames: Tensor | None = None) -> Support:
