@@ -261,7 +261,7 @@ class VG2GT(Reconstructor):
         gaussians: factory of the self-splitting Gaussian head, called with ``in_channels``.
         keep_scale: rescales the enhanced depth to the scale of the backbone's, see :func:`with_scale_of`.
         keep_agreed: keeps the backbone's depth where other views confirm it
-            (:func:`vg2gt.visibility.keep_agreed`); needs ``visibility``.
+            (:func:`vg2gt.visibility.keep_agreed`), except in training; needs ``visibility``.
 
     Raises:
         ValueError: if ``keep_agreed`` is set without ``visibility``.
@@ -351,7 +351,7 @@ class VG2GT(Reconstructor):
         # the camera token is unchanged, so the cameras of the first decoding stay valid
         depth = again.depth * unit[:, None, None, None]
         depth = depth if not self.keep_scale else with_scale_of(initial, depth)
-        if self.keep_agreed and self.visibility is not None:
+        if self.keep_agreed and self.visibility is not None and not self.training:
             depth = keep_agreed(initial, depth, self.visibility)
         return tokens, Decoded(initial, replace(initial, depth=depth, depth_conf=again.depth_conf), unit)
 

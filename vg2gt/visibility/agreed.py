@@ -10,14 +10,17 @@ from vg2gt.types import Geometry
 from vg2gt.visibility.check import ViewCheck, choose_partners
 from vg2gt.visibility.counts import count_views
 
-_AROUND = 9  # pixels per side of the square whose share of confirmed pixels is the weight; a hard choice leaves steps
+# Pixels per side of the square around a pixel; a choice by the pixel alone leaves steps. Chosen on IterMVS with the
+# product of both shares: without the scene's, the office is 7 % worse than before enhancement.
+_AROUND = 9
 
 
 def keep_agreed(initial: Geometry, depth: Tensor, check: ViewCheck) -> Tensor:
-    """Mixes the enhanced depth with the backbone's, by how many of the pixels around it other views confirm.
+    """Mixes the enhanced depth with the backbone's, by how many pixels of it other views confirm.
 
     A pixel is confirmed if another view agrees with its initial depth and none looks through its point. The enhanced
-    depth is learnt mostly from pixels that are far off, and can be less accurate than depth that was matched well.
+    depth is learnt mostly from pixels that are far off, and can be less accurate than depth that was matched well. Its
+    share is the share of pixels that are not confirmed around the pixel, times that of the whole scene.
 
     Args:
         initial: the backbone's geometry of B scenes; used without gradient.
@@ -29,17 +32,18 @@ def keep_agreed(initial: Geometry, depth: Tensor, check: ViewCheck) -> Tensor:
         either is 0.
     """
     before = initial.depth.detach().nan_to_num(0.0, 0.0, 0.0).to(depth.dtype)
-    weight = torch.stack([_confirmed(before[b], initial, b, check) for b in range(len(before))])
+    share = torch.stack([_unconfirmed(before[b], initial, b, check) for b in range(len(before))])
     both = (before > 0) & (depth > 0)
     logs = [torch.where(both, part, 1.0).log() for part in (before, depth)]
-    return torch.where(both, torch.lerp(logs[1], logs[0], weight).exp(), depth)
+    return torch.where(both, torch.lerp(logs[0], logs[1], share).exp(), depth)
 
 
 @torch.no_grad()
-def _confirmed(depth: Tensor, initial: Geometry, scene: int, check: ViewCheck) -> Tensor:
-    """Returns the share ``[V, H, W]`` of confirmed pixels around each pixel of one scene."""
+def _unconfirmed(depth: Tensor, initial: Geometry, scene: int, check: ViewCheck) -> Tensor:
+    """Returns the share ``[V, H, W]`` of unconfirmed pixels around each pixel, times that of the whole scene."""
     cameras = initial.cameras.scene(scene)
     partners = choose_partners(depth, cameras, check.partners)
     counts = count_views(depth, cameras, partners, check.tolerance, check.margin)
-    confirmed = (counts.agree >= 1) & (counts.through == 0)
-    return F.avg_pool2d(confirmed.to(depth.dtype)[:, None], _AROUND, 1, _AROUND // 2, count_include_pad=False)[:, 0]
+    unconfirmed = ((counts.agree == 0) | (counts.through > 0)).to(depth.dtype)
+    around = F.avg_pool2d(unconfirmed[:, None], _AROUND, 1, _AROUND // 2, count_include_pad=False)[:, 0]
+    return around * unconfirmed[depth > 0].mean().nan_to_num(1.0)
