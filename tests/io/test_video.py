@@ -179,7 +179,10 @@ def test_frames_after_a_damaged_one_are_left_out(tmp_path: Path, damaged: list[i
     found = {number: pixels() for number, pixels in sharpest_frames(path, 24, 8)}
     errors = [np.abs(pixels - scene[:, n : n + 160].astype(int)).mean() for n, pixels in found.items()]
     assert (max(errors) < 12) == (damaged == [8])
-    assert [number // 8 for number in found] == ([0, 0, 0, 2, 2, 2] if damaged == [8] else [0, 0, 0, 1, 1, 2, 2, 2])
+    if damaged == [8]:
+        assert [number // 8 for number in found] == [0, 0, 0, 2, 2, 2]
+    else:  # one of each interval; which one depends on what the decoder makes of the damage
+        assert [number // 3 for number in found] == list(range(8))
     assert ("damaged.mkv is damaged: 8 of its frames" in caplog.text) == (damaged == [8])
     assert ("as no others are left" in caplog.text) == (damaged != [8])
 
