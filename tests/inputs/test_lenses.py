@@ -53,5 +53,23 @@ def test_crops_get_the_lens_that_fits(
     assert off.median() < 0.02 * true.norm(dim=-1).mean()
 
 
+def test_lenses_that_fail_leave_what_was_found(tmp_path: Path) -> None:
+    poses, names = orbit(COUNT, turn=200), [f"{number:06d}.jpg" for number in range(COUNT)]
+    database = tmp_path / "database.db"
+
+    def mapped(lenses: Lenses, centre: bool):
+        known = max(next(iter(lenses))[2], 0)
+        database.unlink(missing_ok=True)
+        if not known:
+            raise ValueError("no features")
+        write_database(database, poses, box((1, 2, 3, 4)).joined(floor()), lens=(1000.0, np.zeros(2)), given=known)
+        return Matches.read(database), []
+
+    with quiet_colmap():
+        _, models = with_right_lenses(database, {(*SIZE, 555.0): names}, mapped)
+    assert models == []
+    assert sorted(Matches.read(database).sizes) == names
+
+
 def _centers(poses: np.ndarray) -> list[np.ndarray]:
     return [np.linalg.inv(pose)[:3, 3] for pose in poses]

@@ -98,9 +98,12 @@ def _tried(
 ) -> Found | None:
     """Returns the matches and models of other lenses if they are accepted; else None, with the database as before."""
     kept = database.rename(database.with_suffix(".kept"))
-    found = mapped()
-    if accepts(found[1]):
-        return found
+    try:
+        found = mapped()
+        if accepts(found[1]):
+            return found
+    except ValueError:  # what the images cannot be mapped with is no better
+        log.debug("other lenses failed", exc_info=True)
     kept.replace(database)
     return None
 

@@ -96,17 +96,18 @@ def _shift_of_depth(pictures: Sequence[Picture]) -> int:
         return 0
     middle = max(len(pictures) - _COMPARED, 0) // 2
     step = math.ceil(max(pictures[0].size) / _SMALL)
-    looked = [
-        (one.depth[0, step // 2 :: step, step // 2 :: step].clone(), one.world_to_camera[0], one.intrinsics[0])
-        for picture in pictures[middle : middle + _COMPARED]
-        for one in [picture.read(picture.size)]
-    ]
+    looked = []
+    for picture in pictures[middle : middle + _COMPARED]:
+        seen = picture.read(picture.size)
+        reduced = seen.depth[0, step // 2 :: step, step // 2 :: step].clone()  # frees the full size
+        looked.append((reduced, seen.world_to_camera[0], seen.intrinsics[0]))
     depth, poses, intrinsics = (torch.stack(values) for values in zip(*looked, strict=True))
     inner, small = torch.arange(1, len(depth) - 1), (depth.shape[1], depth.shape[2])
     cameras = Cameras(poses[None, inner], strided_intrinsics(intrinsics, step, step)[None, inner], small)
     against = {}
     for by in (0, 1, -1):
-        geometry = Geometry(moved := depth[None, inner + by], torch.ones_like(moved), cameras, torch.ones(1))
+        moved = depth[None, inner + by]
+        geometry = Geometry(moved, torch.ones_like(moved), cameras, torch.ones(1))
         against[by] = float((pixel_evidence(geometry)[1] == Status.CONTRADICTED).float().mean())
     best = min(against, key=lambda by: against[by])
     return best if against[0] > _SHIFTED and against[best] < against[0] / 2 else 0
