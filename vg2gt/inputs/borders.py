@@ -8,6 +8,7 @@ does neither: its edge differs from image to image.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +21,10 @@ _EDGE = 2  # further pixels, where the image is lit
 _OFTEN = 0.7  # share of the images, and of the pixels along the border, in which they are
 _FEWEST = 3  # images that are compared with each other
 _SAME = 8  # difference of 255 of the colours of one frame in several images
-_STRAIGHT, _DIFFERS = 0.6, 12  # share of the pixels along the edges of a clear frame that differ from it by so much
+_STRAIGHT, _DIFFERS = 0.5, 9  # share of the pixels along the edges of a clear frame that differ from it by so much
 _CLEAR = 0.2  # share of the images of a size that do
+_RINGING = 6  # rows before an edge that compression disturbs, in part
+_RUNG = 0.3  # largest share of the pixels of such a row that differ by so much
 
 
 @dataclass(frozen=True)
@@ -32,7 +35,8 @@ class _Plain:
         name: of the image.
         color: ``[3]`` of the corners.
         off: ``[h, w]`` largest difference of the channels from it.
-        widths: ``[4]`` number of rows or columns of that colour at the top, the bottom, the left and the right.
+        widths: ``[4]`` number of rows or columns of that colour at the top, the bottom, the left and the right. What
+            compression disturbs along a straight edge counts as well.
     """
 
     name: str
@@ -40,15 +44,14 @@ class _Plain:
     off: NDArray[np.int16]
     widths: NDArray[np.int64]
 
-    def is_clear(self, widths: NDArray[np.int64]) -> bool:
-        """Returns whether a frame has exactly such widths and ends abruptly, along straight lines."""
-        if (self.widths != widths).any():
-            return False
+    def clear_sides(self, widths: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Returns on which sides ``[4]`` a frame of such widths ends abruptly, along straight lines."""
         top, bottom, left, right = np.where(widths > 0, widths + _MARGIN, 0).tolist()
         height, width = self.off.shape
         inside = self.off[top : height - bottom, left : width - right] > _DIFFERS
         edges = (inside[:1], inside[-1:], inside[:, :1], inside[:, -1:])
-        return all(edge.size > 0 and edge.mean() >= _STRAIGHT for edge, wide in zip(edges, widths, strict=True) if wide)
+        ends = np.array([edge.size > 0 and edge.mean() >= _STRAIGHT for edge in edges])
+        return ends & (self.widths == widths) & (widths > 0)
 
 
 class Borders:
@@ -77,18 +80,22 @@ class Borders:
 
     def _frames(self) -> dict[str, NDArray[np.float32]]:
         masks: dict[str, NDArray[np.float32]] = {}
-        rest = self.plain
+        rest = [each for each in self.plain if _opposite(each.widths > 0)]
         while rest:
             alike = [each for each in rest if np.abs(each.color - rest[0].color).max() <= _SAME]
             rest = [each for each in rest if np.abs(each.color - rest[0].color).max() > _SAME]
-            widths = np.array([_most_common(own) for own in np.stack([each.widths for each in alike]).T])
-            framed = [each for each in alike if (each.widths >= widths - 1).all()]
-            clear = sum(each.is_clear(widths) for each in framed)
-            if (widths.reshape(2, 2) > 0).all(1).any() and clear >= max(_FEWEST, _CLEAR * len(self.names)):
+            own = np.stack([each.widths for each in alike])
+            widths = np.array([_most_common(side) for side in own.T])
+            clear = np.sum([each.clear_sides(widths) for each in alike], 0) >= max(_FEWEST, _CLEAR * len(self.names))
+            framed = (own[:, clear] >= (widths[clear] - _RINGING).clip(1)).all(1)
+            # an object before a plain background may end along straight lines on two sides, but not on three
+            if _opposite(clear) and (clear | (widths == 0)).sum() >= 3:
+                # where no image shows the edge, as of a white frame along the sky, it is as narrow as in any image
+                widths = np.where(clear, widths, own[framed].min(0))
                 (top, bottom, left, right), (height, width) = np.where(widths > 0, widths + _MARGIN, 0), self.peak.shape
                 mask = np.zeros((height, width), np.float32)
                 mask[top : height - bottom, left : width - right] = 1
-                masks |= {each.name: mask for each in framed}
+                masks |= {each.name: mask for each, is_framed in zip(alike, framed, strict=True) if is_framed}
         return masks
 
     def _black(self) -> NDArray[np.float32] | None:
@@ -112,12 +119,27 @@ def _plain(name: str, pixels: NDArray[np.uint8]) -> _Plain | None:
     if np.abs(corners - color).max() > _BORDER:
         return None
     off = np.abs(pixels - color).max(2)
-    rows, columns = (off.max(axis) > _BORDER for axis in (1, 0))
-    if not rows.any():
+    lit = off > _BORDER
+    if not lit.any():
         return None
-    return _Plain(
-        name, color, off, np.array([int(side.argmax()) for side in (rows, rows[::-1], columns, columns[::-1])])
-    )
+    top, bottom, left, right = (int(side.argmax()) for side in (*_both(lit.any(1)), *_both(lit.any(0))))
+    inside = (off > _DIFFERS)[top : off.shape[0] - bottom, left : off.shape[1] - right]
+    rung = [_until_edge(shares) for shares in (*_both(inside.mean(1)), *_both(inside.mean(0)))]
+    return _Plain(name, color, off, np.array([top, bottom, left, right]) + rung)
+
+
+def _opposite(sides: NDArray[np.bool_]) -> bool:
+    return bool(sides.reshape(2, 2).all(1).any())
+
+
+def _both(row: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    return row, row[::-1]
+
+
+def _until_edge(shares: NDArray[np.float64]) -> int:
+    """Returns the number of rows that compression disturbs before an edge, by the shares of pixels that differ."""
+    edge = int((shares[:_RINGING] >= _STRAIGHT).argmax())
+    return edge if edge > 0 and (shares[: edge - 1] <= _RUNG).all() else 0
 
 
 def _most_common(widths: NDArray[np.int64]) -> int:
