@@ -7,6 +7,7 @@ does neither: its edge differs from image to image.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -54,7 +55,24 @@ class _Plain:
         return ends & (self.widths == widths) & (widths > 0)
 
 
-class Borders:
+def find_borders(images: Mapping[str, NDArray[np.uint8]]) -> dict[str, NDArray[np.float32]]:
+    """Finds the borders of images of one size.
+
+    Args:
+        images: ``[h, w, 3]``, about 320 pixels wide, by name.
+
+    Returns:
+        Masks ``[h, w]``, 0 on borders, of the images that have any, by name.
+    """
+    if len(images) < _FEWEST:
+        return {}
+    borders = _Borders(next(iter(images.values())).shape[:2])
+    for name, pixels in images.items():
+        borders.add(name, pixels)
+    return borders.masks()
+
+
+class _Borders:
     """The borders of the images of one size."""
 
     def __init__(self, shape: tuple[int, ...]) -> None:
@@ -73,8 +91,6 @@ class Borders:
 
     def masks(self) -> dict[str, NDArray[np.float32]]:
         """Returns masks ``[h, w]``, 0 on borders, of the images that have any, by name."""
-        if len(self.names) < _FEWEST:
-            return {}
         black = self._black()
         return dict.fromkeys(self.names, black) if black is not None else self._frames()
 
@@ -87,7 +103,7 @@ class Borders:
             own = np.stack([each.widths for each in alike])
             widths = np.array([_most_common(side) for side in own.T])
             clear = np.sum([each.clear_sides(widths) for each in alike], 0) >= max(_FEWEST, _CLEAR * len(self.names))
-            framed = (own[:, clear] >= (widths[clear] - _RINGING).clip(1)).all(1)
+            framed = np.all(own[:, clear] >= (widths[clear] - _RINGING).clip(1), axis=1, keepdims=True)[:, 0]
             # an object before a plain background may end along straight lines on two sides, but not on three
             if _opposite(clear) and (clear | (widths == 0)).sum() >= 3:
                 # where no image shows the edge, as of a white frame along the sky, it is as narrow as in any image
@@ -124,8 +140,8 @@ def _plain(name: str, pixels: NDArray[np.uint8]) -> _Plain | None:
         return None
     top, bottom, left, right = (int(side.argmax()) for side in (*_both(lit.any(1)), *_both(lit.any(0))))
     inside = (off > _DIFFERS)[top : off.shape[0] - bottom, left : off.shape[1] - right]
-    rung = [_until_edge(shares) for shares in (*_both(inside.mean(1)), *_both(inside.mean(0)))]
-    return _Plain(name, color, off, np.array([top, bottom, left, right]) + rung)
+    rung = np.array([_until_edge(shares) for shares in (*_both(inside.mean(1)), *_both(inside.mean(0)))], np.int64)
+    return _Plain(name, color, off, np.array([top, bottom, left, right], np.int64) + rung)
 
 
 def _opposite(sides: NDArray[np.bool_]) -> bool:

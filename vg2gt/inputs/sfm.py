@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-FORMAT = 1
+FORMAT = 2
 """Version of the folder's format; increment it when the format changes."""
 _IMAGE_SIDE = 1600  # maximum longer side of the kept images, in pixels
 _LARGE_SIDE = 1200  # features of images from this longer side on are searched without doubling the images first

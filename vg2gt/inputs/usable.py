@@ -1,4 +1,4 @@
-"""Leaves out pictures that show nothing (damaged, black, blurred, hidden) or nothing new, and masks borders."""
+"""Leaves out pictures that show nothing (damaged, black, blurred, hidden) or nothing new; masks borders and texts."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from PIL import Image
 from vg2gt.data.base import DataError, Frames
 from vg2gt.data.sources.masks import joined_masks, resized_mask
 from vg2gt.data.transforms import to_bytes
-from vg2gt.inputs.borders import Borders
+from vg2gt.inputs.borders import find_borders
 from vg2gt.inputs.damaged import name_left_out, reason_of
 from vg2gt.inputs.distinct import Versions, without_copies
+from vg2gt.inputs.overlays import find_overlays
 from vg2gt.inputs.pictures import IN_MEMORY, Picture
 from vg2gt.io.errors import some
 from vg2gt.io.images import curvatures
@@ -62,7 +63,8 @@ class _Look:
 def usable_pictures(pictures: Sequence[Picture], monitor: Monitor) -> list[Picture]:
     """Returns the pictures that can be read and show something; of identical files, only the first.
 
-    Those left out are named in a warning. Borders (:mod:`vg2gt.inputs.borders`) are masked.
+    Those left out are named in a warning. Borders (:mod:`vg2gt.inputs.borders`) and what was drawn over images
+    (:mod:`vg2gt.inputs.overlays`) are masked.
 
     Args:
         pictures: the pictures; each is decoded once, at a small size. Long videos are not looked at.
@@ -76,7 +78,7 @@ def usable_pictures(pictures: Sequence[Picture], monitor: Monitor) -> list[Pictu
         return pictures
     looks: dict[str, _Look] = {}
     faults: dict[str, str] = {}
-    borders: dict[tuple[int, int], Borders] = {}
+    by_size: dict[tuple[int, int], dict[str, NDArray[np.uint8]]] = {}
     versions, before = Versions(pictures), np.zeros((0, 0, 3), np.uint8)
     with monitor.stage("check images", len(pictures)) as advance:
         for picture in pictures:
@@ -93,7 +95,7 @@ def usable_pictures(pictures: Sequence[Picture], monitor: Monitor) -> list[Pictu
                 versions.add(picture, pixels)
                 looks[picture.name] = _look(pixels)
                 if _may_have_borders(picture):
-                    borders.setdefault(picture.size, Borders(pixels.shape[:2])).add(picture.name, pixels)
+                    by_size.setdefault(picture.size, {})[picture.name] = pixels
             advance()
     faults |= _faults(looks)
     faults |= versions.faults(faults)
@@ -104,12 +106,10 @@ def usable_pictures(pictures: Sequence[Picture], monitor: Monitor) -> list[Pictu
             "their halves, or the scene will be wrong: %s", len(pairs), some(pairs),
         )  # fmt: skip
     name_left_out(faults, len(pictures))
-    masks = {name: mask for own in borders.values() for name, mask in own.masks().items() if name not in faults}
-    if masks:
-        share = 100 * np.mean([1 - mask.mean() for mask in masks.values()])
-        log.warning(
-            "%d images have borders of one colour, %.1f %% of their pixels, which are masked", len(masks), share
-        )
+    is_video = any(picture.container is not None for picture in pictures)
+    masks = _masks_of(
+        [{name: each[name] for name in each if name not in faults} for each in by_size.values()], is_video
+    )
     found = [each for each in pictures if each.name not in faults]
     return [_masked(each, masks[each.name]) if each.name in masks else each for each in found]
 
@@ -117,6 +117,26 @@ def usable_pictures(pictures: Sequence[Picture], monitor: Monitor) -> list[Pictu
 def _may_have_borders(picture: Picture) -> bool:
     """Returns whether borders of a picture are to be looked for: not where we undistort it, nor with depth."""
     return not picture.lens and not picture.has_depth
+
+
+def _masks_of(groups: Sequence[dict[str, NDArray[np.uint8]]], is_video: bool) -> dict[str, NDArray[np.float32]]:
+    """Returns masks ``[h, w]``, 0 on borders and on what was drawn over images, of those that have any, by name.
+
+    Args:
+        groups: images of one size each, by name.
+        is_video: whether they are frames of videos, in order.
+    """
+    borders: dict[str, NDArray[np.float32]] = {}
+    overlays: dict[str, NDArray[np.float32]] = {}
+    for group in groups:
+        borders |= find_borders(group)
+        drawn = find_overlays([*group.values()], is_video)
+        overlays |= {name: 1 - own.astype(np.float32) for name, own in zip(group, drawn, strict=True) if own.any()}
+    for masks, what in ((borders, "have borders of one colour"), (overlays, "have a logo, a date or a text over them")):
+        if masks:
+            share = 100 * np.mean([1 - mask.mean() for mask in masks.values()])
+            log.warning("%d images %s, %.1f %% of their pixels, which are masked", len(masks), what, share)
+    return {name: borders.get(name, 1) * overlays.get(name, np.float32(1)) for name in borders | overlays}
 
 
 def _small(picture: Picture) -> tuple[NDArray[np.uint8], float]:
