@@ -30,12 +30,13 @@ from vg2gt.memory import RECONSTRUCTION, memory_advice, note_sizes
 from vg2gt.model import Reconstructor
 from vg2gt.monitor import Monitor
 from vg2gt.reconstruction.frame import SceneFrame, first_frame
+from vg2gt.reconstruction.measured import doubt_of_depth
 from vg2gt.reconstruction.order import as_given, in_order, working_order
 from vg2gt.reconstruction.policy import Quality, Refinement, check_refinement
 from vg2gt.reconstruction.refined import refined_by_policy
 from vg2gt.reconstruction.scene import Scene
 from vg2gt.reconstruction.surroundings import with_surroundings
-from vg2gt.reconstruction.trust import doubt_of_depth, odd_views, pixel_trust
+from vg2gt.reconstruction.trust import odd_views, pixel_trust
 from vg2gt.reconstruction.windows import WINDOWS
 from vg2gt.reconstruction.windows.run import WindowRun, device_of, window_model
 from vg2gt.reconstruction.windows.store import window_size

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -10,10 +9,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from vg2gt.geometry.cameras import strided_intrinsics
 from vg2gt.inputs.camera_source import CameraSource
-from vg2gt.inputs.pictures import Picture
-from vg2gt.types import Cameras, Geometry, Prediction
+from vg2gt.types import Prediction
 from vg2gt.uncertainty import STATED, Calibration
 from vg2gt.visibility import Status, pixel_evidence
 
@@ -29,12 +26,6 @@ _DOUBTS = {
 }
 _FEW = 0.5  # share of confirmed Gaussians below which the summary gives advice; a round number, not tuned
 _ODD, _USUAL = 0.25, 0.2  # share of a view's pixels that contradict others from which it is odd, and of most views
-# Share of pixels, in the median view, in which measured depth is wrong; 0.02 at most in three recordings, 0.08 with 2 %
-# of noise on top, 0.29 and more with another unit, inverse depth or distances along rays.
-_MEASURED = 0.15
-# Fewest and most images, and their longer side in pixels, whose depth is tried at the image before and after; share of
-# the pixels that contradict others, above which a neighbour with half of it is the right image.
-_FEWEST, _COMPARED, _SMALL, _SHIFTED = 4, 24, 160, 0.02
 _GIVEN = (
     ", or the given cameras do not fit the images (axes of another convention, another order, inverted poses): --poses "
     "sfm ignores them"
@@ -62,55 +53,6 @@ def pixel_trust(
     if mask is not None:
         status[mask <= 0.5] = Status.UNSEEN
     return None if error is None else error.cpu()[back], status
-
-
-def doubt_of_depth(pictures: Sequence[Picture], support: Tensor) -> str:
-    """Returns what is wrong with measured depth that contradicts other views; empty if nothing is, or none is measured.
-
-    Args:
-        pictures: the views.
-        support: ``[V, H, W]`` :class:`vg2gt.visibility.Status` of each pixel.
-    """
-    if not all(picture.has_depth for picture in pictures):
-        return ""
-    if by := _shift_of_depth(pictures):
-        whose = "before" if by > 0 else "after"
-        return f"the measured depth of images is that of the image {whose} them, which it fits better: pair them again"
-    against = torch.stack([(view == Status.CONTRADICTED).float().mean() for view in support]).median().item()
-    if against <= _MEASURED:
-        return ""
-    return (
-        f"the measured depth of most images contradicts that of others, in {100 * against:.0f} % of their pixels: "
-        "check that it is in the unit of the poses (integers: 1,000 a metre), along the camera's axis rather than the "
-        "ray, not inverse, and of these images and poses"
-    )
-
-
-def _shift_of_depth(pictures: Sequence[Picture]) -> int:
-    """Returns 1 if the depth of images fits the image before each, -1 the one after, 0 if it fits the image itself.
-
-    Small copies of a row of images are compared. Of right recordings, .02 of the pixels contradict others at most, also
-    with 2 % of noise, and six times as many or more if shifted by an image.
-    """
-    if len(pictures) < _FEWEST or len({picture.size for picture in pictures}) > 1:
-        return 0
-    middle = max(len(pictures) - _COMPARED, 0) // 2
-    step = math.ceil(max(pictures[0].size) / _SMALL)
-    looked = []
-    for picture in pictures[middle : middle + _COMPARED]:
-        seen = picture.read(picture.size)
-        reduced = seen.depth[0, step // 2 :: step, step // 2 :: step].clone()  # frees the full size
-        looked.append((reduced, seen.world_to_camera[0], seen.intrinsics[0]))
-    depth, poses, intrinsics = (torch.stack(values) for values in zip(*looked, strict=True))
-    inner, small = torch.arange(1, len(depth) - 1), (depth.shape[1], depth.shape[2])
-    cameras = Cameras(poses[None, inner], strided_intrinsics(intrinsics, step, step)[None, inner], small)
-    against = {}
-    for by in (0, 1, -1):
-        moved = depth[None, inner + by]
-        geometry = Geometry(moved, torch.ones_like(moved), cameras, torch.ones(1))
-        against[by] = float((pixel_evidence(geometry)[1] == Status.CONTRADICTED).float().mean())
-    best = min(against, key=lambda by: against[by])
-    return best if against[0] > _SHIFTED and against[best] < against[0] / 2 else 0
 
 
 def odd_views(support: Tensor) -> list[int]:
