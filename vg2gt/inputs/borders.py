@@ -7,7 +7,6 @@ does neither: its edge differs from image to image.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -55,24 +54,7 @@ class _Plain:
         return ends & (self.widths == widths) & (widths > 0)
 
 
-def find_borders(images: Mapping[str, NDArray[np.uint8]]) -> dict[str, NDArray[np.float32]]:
-    """Finds the borders of images of one size.
-
-    Args:
-        images: ``[h, w, 3]``, about 320 pixels wide, by name.
-
-    Returns:
-        Masks ``[h, w]``, 0 on borders, of the images that have any, by name.
-    """
-    if len(images) < _FEWEST:
-        return {}
-    borders = _Borders(next(iter(images.values())).shape[:2])
-    for name, pixels in images.items():
-        borders.add(name, pixels)
-    return borders.masks()
-
-
-class _Borders:
+class Borders:
     """The borders of the images of one size."""
 
     def __init__(self, shape: tuple[int, ...]) -> None:
@@ -91,6 +73,8 @@ class _Borders:
 
     def masks(self) -> dict[str, NDArray[np.float32]]:
         """Returns masks ``[h, w]``, 0 on borders, of the images that have any, by name."""
+        if len(self.names) < _FEWEST:
+            return {}
         black = self._black()
         return dict.fromkeys(self.names, black) if black is not None else self._frames()
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+import math
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +15,7 @@ from PIL import Image
 from vg2gt.data.base import DataError, Frames
 from vg2gt.data.sources.masks import joined_masks, resized_mask
 from vg2gt.data.transforms import to_bytes
-from vg2gt.inputs.borders import find_borders
+from vg2gt.inputs.borders import Borders
 from vg2gt.inputs.damaged import name_left_out, reason_of
 from vg2gt.inputs.distinct import Versions, without_copies
 from vg2gt.inputs.overlays import find_overlays
@@ -60,6 +61,19 @@ class _Look:
     is_pair: bool
 
 
+@dataclass(frozen=True)
+class _SameSize:
+    """Pictures of one size.
+
+    Attributes:
+        borders: their borders.
+        some: small copies ``[h, w, 3]`` of up to 100 of them, by name.
+    """
+
+    borders: Borders
+    some: dict[str, NDArray[np.uint8]]
+
+
 def usable_pictures(pictures: Sequence[Picture], monitor: Monitor) -> list[Picture]:
     """Returns the pictures that can be read and show something; of identical files, only the first.
 
@@ -78,10 +92,10 @@ def usable_pictures(pictures: Sequence[Picture], monitor: Monitor) -> list[Pictu
         return pictures
     looks: dict[str, _Look] = {}
     faults: dict[str, str] = {}
-    by_size: dict[tuple[int, int], dict[str, NDArray[np.uint8]]] = {}
+    by_size: dict[tuple[int, int], _SameSize] = {}
     versions, before = Versions(pictures), np.zeros((0, 0, 3), np.uint8)
     with monitor.stage("check images", len(pictures)) as advance:
-        for picture in pictures:
+        for number, picture in enumerate(pictures):
             try:
                 pixels, shown = _small(picture)
             except DataError as error:
@@ -95,7 +109,10 @@ def usable_pictures(pictures: Sequence[Picture], monitor: Monitor) -> list[Pictu
                 versions.add(picture, pixels)
                 looks[picture.name] = _look(pixels)
                 if _may_have_borders(picture):
-                    by_size.setdefault(picture.size, {})[picture.name] = pixels
+                    group = by_size.setdefault(picture.size, _SameSize(Borders(pixels.shape[:2]), {}))
+                    group.borders.add(picture.name, pixels)
+                    if number % math.ceil(len(pictures) / IN_MEMORY) == 0:
+                        group.some[picture.name] = pixels
             advance()
     faults |= _faults(looks)
     faults |= versions.faults(faults)
@@ -107,9 +124,7 @@ def usable_pictures(pictures: Sequence[Picture], monitor: Monitor) -> list[Pictu
         )  # fmt: skip
     name_left_out(faults, len(pictures))
     is_video = any(picture.container is not None for picture in pictures)
-    masks = _masks_of(
-        [{name: each[name] for name in each if name not in faults} for each in by_size.values()], is_video
-    )
+    masks = _masks_of([*by_size.values()], faults, is_video)
     found = [each for each in pictures if each.name not in faults]
     return [_masked(each, masks[each.name]) if each.name in masks else each for each in found]
 
@@ -119,19 +134,24 @@ def _may_have_borders(picture: Picture) -> bool:
     return not picture.lens and not picture.has_depth
 
 
-def _masks_of(groups: Sequence[dict[str, NDArray[np.uint8]]], is_video: bool) -> dict[str, NDArray[np.float32]]:
+def _masks_of(groups: Sequence[_SameSize], left_out: Container[str], is_video: bool) -> dict[str, NDArray[np.float32]]:
     """Returns masks ``[h, w]``, 0 on borders and on what was drawn over images, of those that have any, by name.
 
     Args:
-        groups: images of one size each, by name.
+        groups: the pictures of each size.
+        left_out: names of those that are not used.
         is_video: whether they are frames of videos, in order.
     """
     borders: dict[str, NDArray[np.float32]] = {}
     overlays: dict[str, NDArray[np.float32]] = {}
     for group in groups:
-        borders |= find_borders(group)
-        drawn = find_overlays([*group.values()], is_video)
-        overlays |= {name: 1 - own.astype(np.float32) for name, own in zip(group, drawn, strict=True) if own.any()}
+        borders |= {name: mask for name, mask in group.borders.masks().items() if name not in left_out}
+        looked_at = {name: pixels for name, pixels in group.some.items() if name not in left_out}
+        drawn = dict(zip(looked_at, find_overlays([*looked_at.values()], is_video), strict=True))
+        for name in (name for name in group.borders.names if name not in left_out):
+            own = drawn.get(name, next(iter(drawn.values()), np.zeros(0)))  # photographs have the same everywhere
+            if own.any():
+                overlays[name] = 1 - own.astype(np.float32)
     for masks, what in ((borders, "have borders of one colour"), (overlays, "have a logo, a date or a text over them")):
         if masks:
             share = 100 * np.mean([1 - mask.mean() for mask in masks.values()])
