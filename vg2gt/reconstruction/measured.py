@@ -23,10 +23,11 @@ _MEASURED = 0.15
 # the pixels that contradict others, above which a neighbour with half of it is the right image.
 _FEWEST, _COMPARED, _SMALL, _SHIFTED = 4, 24, 160, 0.02
 # Steps of depth and edges of images lie on each other in right recordings: up to 1 pixel of 320 apart in three of them.
-_SIDE, _LOOKED_AT, _REACH = 320, 24, 20  # longer side of the copies, number of images, and greatest offset in pixels
+_SIDE, _REACH = 320, 20  # longer side of the copies, and greatest offset, in pixels
+_FEWEST_ALIGNED, _LOOKED_AT = 12, 32  # fewest and most images
 _STEP, _AROUND, _NOISE = 1.08, 31, 2.0  # ratio of depths at a step; pixels and values over which edges are normalised
-_FEWEST_STEPS = 200  # pixels at steps of all images
-_APART = 3  # least offset that is said, in pixels
+_FEWEST_STEPS = 150  # pixels at steps of each half of the images
+_APART, _ALIKE = 3, 2  # least offset that is said, in pixels, and greatest difference of what two halves show
 _STRONG, _CLEARER = 0.15, 1.25  # edges there above those elsewhere, and how much more that is than without an offset
 
 
@@ -96,28 +97,40 @@ def offset_of_depth(pictures: Sequence[Picture]) -> tuple[int, int] | None:
     """
     cell = max(1, round(max(pictures[0].size) / _SIDE))
     if (
-        len(pictures) < _FEWEST
+        len(pictures) < _FEWEST_ALIGNED
         or min(pictures[0].size) < 6 * _REACH * cell
         or len({each.size for each in pictures}) > 1
     ):
         return None
     looked_at = pictures[:: math.ceil(len(pictures) / _LOOKED_AT)]
-    # edges of the images, on average over the steps of depth, at each offset: cross-correlation
-    reach, strength = range(-_REACH, _REACH + 1), np.zeros((2 * _REACH + 1, 2 * _REACH + 1))
-    count = 0.0
-    for picture in looked_at:
-        image, steps = _edges(picture, cell)
-        product = np.fft.irfft2(np.fft.rfft2(image) * np.fft.rfft2(steps).conj(), image.shape)
-        strength += product[np.ix_(reach, reach)]
-        count += steps.sum()
-    if count < _FEWEST_STEPS:
+    halves = [_strength(part, cell) for part in (looked_at[: len(looked_at) // 2], looked_at[len(looked_at) // 2 :])]
+    if min(count for _, count in halves) < _FEWEST_STEPS:
         return None
-    down, right = (int(index) - _REACH for index in np.unravel_index(strength.argmax(), strength.shape))
+    strength = halves[0][0] + halves[1][0]
     excess = strength / np.median(strength) - 1
+    down, right = _peak(strength)
     clear = excess.max() > max(_STRONG, _CLEARER * excess[_REACH, _REACH])
     if not clear or not _APART <= max(abs(down), abs(right)) < _REACH:
         return None
-    return -right * cell, -down * cell
+    # a pattern on a floor may fit elsewhere in some images, but not in others
+    alike = all(max(abs(y - down), abs(x - right)) <= _ALIKE for y, x in (_peak(own) for own, _ in halves))
+    return (-right * cell, -down * cell) if alike else None
+
+
+def _strength(pictures: Sequence[Picture], cell: int) -> tuple[NDArray[np.float64], float]:
+    """Returns the edges of images, summed over the steps of their depth, at each offset, and the number of steps."""
+    reach, strength, count = range(-_REACH, _REACH + 1), np.zeros((2 * _REACH + 1, 2 * _REACH + 1)), 0.0
+    for picture in pictures:
+        image, steps = _edges(picture, cell)
+        product = np.fft.irfft2(np.fft.rfft2(image) * np.fft.rfft2(steps).conj(), image.shape)  # cross-correlation
+        strength += product[np.ix_(reach, reach)]
+        count += float(steps.sum())
+    return strength, count
+
+
+def _peak(strength: NDArray[np.float64]) -> tuple[int, int]:
+    down, right = (int(index) - _REACH for index in np.unravel_index(strength.argmax(), strength.shape))
+    return down, right
 
 
 def _edges(picture: Picture, cell: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
