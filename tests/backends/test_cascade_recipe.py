@@ -36,7 +36,7 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 def test_samples_depend_on_their_number_alone(scenes: list[Path]) -> None:
     """From 2 to 12 views; sources are other views; what is hidden or seen by one view only weighs more."""
     samples, again = (CascadeSamples(scenes, 0, shapes=SHAPES) for _ in range(2))
-    drawn = [samples[n] for n in range(24)]
+    drawn = [samples[n] for n in range(14)]
     assert all(torch.equal(a, b) for a, b in zip(drawn[7], again[7], strict=True))
     assert {len(sample.images) for sample in drawn} == {2, 12}
     for sample in drawn:
@@ -46,7 +46,7 @@ def test_samples_depend_on_their_number_alone(scenes: list[Path]) -> None:
         assert (sample.weight[hidden] == 2).all()
         assert sample.weight.min() >= 1
     orphaned = [sample for sample in drawn if not sample.shown.all()]
-    assert 1 <= len(orphaned) <= 10
+    assert 1 <= len(orphaned) <= 7
     plain = CascadeSamples(scenes, 0, shapes=SHAPES, plain=True)
     assert all(plain[n].shown.all() for n in range(6))
 

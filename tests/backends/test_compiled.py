@@ -17,8 +17,15 @@ def encode(backend, make_scene) -> list[Tokens]:
     return [backend.encode(*make_scene(1, views, size)) for views, size in SIZES]
 
 
-@pytest.mark.parametrize("name", ["da3_tiny", "vggt_tiny"])
-@pytest.mark.parametrize("kind", ["aot_eager", pytest.param("inductor", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("da3_tiny", "aot_eager"),
+        pytest.param("vggt_tiny", "aot_eager", marks=pytest.mark.slow),
+        pytest.param("da3_tiny", "inductor", marks=pytest.mark.slow),
+        pytest.param("vggt_tiny", "inductor", marks=pytest.mark.slow),
+    ],
+)
 def test_compiled_blocks_equal_the_plain_ones_at_all_sizes(name, kind, make_backend, make_scene, monkeypatch) -> None:
     torch._dynamo.reset()
     graphs = CompileCounterWithBackend(kind)

@@ -28,7 +28,7 @@ def make(overrides: tuple[str, ...], folder: Path, cache: Path, patch: pytest.Mo
     return run, good
 
 
-TRAINED = [(1, FULL), (1, BASELINES[1])]
+TRAINED = [(1, FULL)]
 TRAINED += [pytest.param(3, model, marks=pytest.mark.slow) for model in (FULL, *ABLATIONS, *BASELINES)]
 
 

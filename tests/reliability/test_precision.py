@@ -106,7 +106,7 @@ def check_agreement(overrides: tuple[str, ...], steps: int, folder: Path, cache:
         assert scores[1][name] == pytest.approx(scores[0][name], abs=tolerance), name
 
 
-@pytest.mark.parametrize("overrides", [PLAIN, ()], ids=["plain", "surfels"])
+@pytest.mark.parametrize("overrides", [pytest.param(PLAIN, marks=pytest.mark.slow), ()], ids=["plain", "surfels"])
 def test_bfloat16_networks_agree_with_float32(overrides: tuple[str, ...], tmp_path: Path, cache: Path) -> None:
     check_agreement(overrides, STEPS, tmp_path, cache)
 

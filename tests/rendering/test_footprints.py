@@ -107,7 +107,7 @@ def test_the_references_absolute_gradient_sums_over_pixels(mode: Mode) -> None:
     torch.testing.assert_close(found, expected.detach(), rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize(("mode", "depth"), KINDS)
+@pytest.mark.parametrize(("mode", "depth"), [KINDS[0], pytest.param(*KINDS[1], marks=pytest.mark.slow), KINDS[2]])
 def test_the_compiled_renderer_equals_the_reference(mode: Mode, depth: DepthKind) -> None:
     gaussians, cameras = some_hidden(2, 30)
     options = {"mode": mode, "depth": depth, "bisections": 40}

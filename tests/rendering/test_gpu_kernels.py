@@ -19,7 +19,6 @@ NVIDIA = ("sm_80", "sm_90", "sm_100")
 REGISTERS = {"project": 80, "emit": 40, "list": 40, "blend": 80, "backward": 80, "project_backward": 168}
 SPILLS = {"project_backward": 16}  # bytes a thread
 SHORT = (
-    "project solid=True antialiased=False degree=1",
     "project solid=True antialiased=True degree=2",
     "emit",
     "list",

@@ -84,7 +84,7 @@ def test_the_search_for_the_median_equals_the_reference(options):
     assert_same_render(found, expected, atol=1e-10)
 
 
-@pytest.mark.parametrize("opacity", [0.1, 0.3, 0.6])
+@pytest.mark.parametrize("opacity", [0.1, 0.3, pytest.param(0.6, marks=pytest.mark.slow)])
 def test_the_compiled_search_crosses_gaps(opacity: float) -> None:
     """A translucent wall, and one forty times as far: between them nothing tells where the median is."""
     near, cameras = wall(1000, (16, 24))
