@@ -7,6 +7,7 @@ import pytest
 from PIL import Image, ImageDraw, ImageFont
 from scipy import ndimage
 
+from vg2gt.inputs import usable
 from vg2gt.inputs.overlays import find_overlays
 from vg2gt.inputs.pictures import find_pictures
 from vg2gt.inputs.usable import usable_pictures
@@ -40,13 +41,15 @@ def where(images: list[np.ndarray], plain: list[np.ndarray]) -> list[np.ndarray]
 
 
 @pytest.mark.parametrize("opaque", [255, 140])
-def test_logos_and_dates_are_masked_in_photographs(tmp_path: Path, opaque: int, caplog) -> None:
-    plain = views(9)
+def test_logos_and_dates_are_masked_in_photographs(tmp_path: Path, opaque: int, caplog, monkeypatch) -> None:
+    """Also in those that are not among the samples."""
+    monkeypatch.setattr(usable, "IN_MEMORY", 9)
+    plain = views(18)
     images = [written(written(own, "NEWS 24", (225, 10), opaque), "30.11.2026", (12, 150)) for own in plain]
     for number, own in enumerate(images):
         Image.fromarray(own).save(tmp_path / f"{number}.jpg", quality=90)
     found = usable_pictures(find_pictures(tmp_path), Monitor())
-    assert "9 images have a logo, a date or a text over them" in caplog.text
+    assert "18 images have a logo, a date or a text over them" in caplog.text
     mask = found[3].read(SHAPE).mask[0].numpy()
     assert mask[where(images, plain)[3]].mean() < 0.02
     assert mask.mean() > 0.85

@@ -87,7 +87,7 @@ class Borders:
             own = np.stack([each.widths for each in alike])
             widths = np.array([_most_common(side) for side in own.T])
             clear = np.sum([each.clear_sides(widths) for each in alike], 0) >= max(_FEWEST, _CLEAR * len(self.names))
-            framed = np.all(own[:, clear] >= (widths[clear] - _RINGING).clip(1), axis=1, keepdims=True)[:, 0]
+            framed = np.asarray((own[:, clear] >= (widths[clear] - _RINGING).clip(1)).all(1))
             # an object before a plain background may end along straight lines on two sides, but not on three
             if _opposite(clear) and (clear | (widths == 0)).sum() >= 3:
                 # where no image shows the edge, as of a white frame along the sky, it is as narrow as in any image

@@ -210,7 +210,7 @@ def _fitting_shares(matches: Matches, views: dict[str, CheckedView]) -> dict[tup
 def better_lens(matches: Matches, views: dict[str, CheckedView]) -> str:
     """Says which other focal length or principal point makes matches fit much better; empty if the given ones fit."""
 
-    def distance(scale: Sequence[float] = (1, 1), shift: Sequence[float] = (0, 0)) -> float:
+    def _distance(scale: Sequence[float] = (1, 1), shift: Sequence[float] = (0, 0)) -> float:
         change = np.diag([*scale, 1.0])
         moved = {}
         for name, view in views.items():
@@ -220,13 +220,13 @@ def better_lens(matches: Matches, views: dict[str, CheckedView]) -> str:
         found = list(_distances(matches, moved).values())
         return float(np.median(np.minimum(np.concatenate(found), _WITHIN))) if found else 0.0
 
-    if (given := distance()) <= _NEAR:
+    if (given := _distance()) <= _NEAR:
         return ""
-    tried = [(distance((f, f)), f"a focal length of about {f:.2f} times the given one") for f in _FOCAL]
-    tried += [(distance((1, f)), f"a vertical focal length of about {f:.2f} times the given one") for f in _FOCAL]
+    tried = [(_distance((f, f)), f"a focal length of about {f:.2f} times the given one") for f in _FOCAL]
+    tried += [(_distance((1, f)), f"a vertical focal length of about {f:.2f} times the given one") for f in _FOCAL]
     for kind, axis in (("width", (1, 0)), ("height", (0, 1))):
         said = f"a principal point moved by about {{:+.0%}} of the {kind}"
-        tried += [(distance(shift=share * np.array(axis)), said.format(share)) for share in _CENTER]
+        tried += [(_distance(shift=share * np.array(axis)), said.format(share)) for share in _CENTER]
     least, best = min(tried)
     return best if least < _BETTER * given else ""
 

@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 FORMAT = 2
-"""Version of the folder's format; increment it when the format changes."""
+"""Version of the folder; increment it when its format changes, or what is masked in images."""
 _IMAGE_SIDE = 1600  # maximum longer side of the kept images, in pixels
 _LARGE_SIDE = 1200  # features of images from this longer side on are searched without doubling the images first
 _FEATURE_SIDE, _FEATURES = 1280, 4096  # longer side of doubled images before doubling, maximum number of features

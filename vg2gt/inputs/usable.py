@@ -67,11 +67,11 @@ class _SameSize:
 
     Attributes:
         borders: their borders.
-        some: small copies ``[h, w, 3]`` of up to 100 of them, by name.
+        samples: small copies ``[h, w, 3]`` by name, of about 100 photographs at most and of all frames of videos.
     """
 
     borders: Borders
-    some: dict[str, NDArray[np.uint8]]
+    samples: dict[str, NDArray[np.uint8]]
 
 
 def usable_pictures(pictures: Sequence[Picture], monitor: Monitor) -> list[Picture]:
@@ -111,8 +111,8 @@ def usable_pictures(pictures: Sequence[Picture], monitor: Monitor) -> list[Pictu
                 if _may_have_borders(picture):
                     group = by_size.setdefault(picture.size, _SameSize(Borders(pixels.shape[:2]), {}))
                     group.borders.add(picture.name, pixels)
-                    if number % math.ceil(len(pictures) / IN_MEMORY) == 0:
-                        group.some[picture.name] = pixels
+                    if picture.container is not None or number % math.ceil(len(pictures) / IN_MEMORY) == 0:
+                        group.samples[picture.name] = pixels
             advance()
     faults |= _faults(looks)
     faults |= versions.faults(faults)
@@ -146,12 +146,11 @@ def _masks_of(groups: Sequence[_SameSize], left_out: Container[str], is_video: b
     overlays: dict[str, NDArray[np.float32]] = {}
     for group in groups:
         borders |= {name: mask for name, mask in group.borders.masks().items() if name not in left_out}
-        looked_at = {name: pixels for name, pixels in group.some.items() if name not in left_out}
+        looked_at = {name: pixels for name, pixels in group.samples.items() if name not in left_out}
         drawn = dict(zip(looked_at, find_overlays([*looked_at.values()], is_video), strict=True))
-        for name in (name for name in group.borders.names if name not in left_out):
-            own = drawn.get(name, next(iter(drawn.values()), np.zeros(0)))  # photographs have the same everywhere
-            if own.any():
-                overlays[name] = 1 - own.astype(np.float32)
+        everywhere = np.logical_and.reduce([*drawn.values()]) if drawn else np.zeros(0, bool)  # in those not sampled
+        shown = {name: drawn.get(name, everywhere) for name in group.borders.names if name not in left_out}
+        overlays |= {name: 1 - own.astype(np.float32) for name, own in shown.items() if own.any()}
     for masks, what in ((borders, "have borders of one colour"), (overlays, "have a logo, a date or a text over them")):
         if masks:
             share = 100 * np.mean([1 - mask.mean() for mask in masks.values()])

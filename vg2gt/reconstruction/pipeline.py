@@ -30,7 +30,7 @@ from vg2gt.memory import RECONSTRUCTION, memory_advice, note_sizes
 from vg2gt.model import Reconstructor
 from vg2gt.monitor import Monitor
 from vg2gt.reconstruction.frame import SceneFrame, first_frame
-from vg2gt.reconstruction.measured import doubt_of_depth
+from vg2gt.reconstruction.measured_depth import doubt_of_depth
 from vg2gt.reconstruction.order import as_given, in_order, working_order
 from vg2gt.reconstruction.policy import Quality, Refinement, check_refinement
 from vg2gt.reconstruction.refined import refined_by_policy

@@ -7,7 +7,7 @@ import pytest
 from tests.data.sources.layout_rgbd import write_recording
 from vg2gt.data import SyntheticScenes
 from vg2gt.inputs.given_cameras import given_pictures
-from vg2gt.reconstruction.measured import offset_of_depth
+from vg2gt.reconstruction.measured_depth import offset_of_depth
 
 
 @pytest.mark.parametrize("shift", [(0, 0), (0, 6), (-5, -4), (1, 1)])
