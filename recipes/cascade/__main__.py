@@ -1,8 +1,8 @@
 """Trains the cascade: ``python -m recipes.cascade [key=value ...]``; options in ``train.yaml``.
 
 Training has no planned end: the rate is constant, and the weights to use are a moving average. It continues from
-``OUT/state.safetensors`` if that exists, else from ``begin``; with ``cooldown`` steps the rate falls to zero, and only
-the weights are written.
+``OUT/state.safetensors`` if that exists, else from ``begin``. With ``cooldown`` steps the rate falls to zero, all is
+written to ``OUT/cooled``, and a fall that was stopped continues there.
 """
 
 from __future__ import annotations
@@ -45,12 +45,14 @@ class Training:
 
     def __init__(self, options: DictConfig, state: Path | None = None) -> None:
         self.options, self.step, self.seconds, self.here = options, 0, 0.0, 0
+        self.fallen = 0  # steps of a falling rate
         self.net: Any = CascadeNet().to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
         self.averaged = {name: value.detach().clone().float() for name, value in self.net.state_dict().items()}
         if state:
             with safe_open(state, "pt") as file:
                 metadata = file.metadata()
             self.step, self.seconds = int(metadata.get("step", 0)), float(metadata.get("seconds", 0))
+            self.fallen = int(metadata.get("fallen", 0))
             tensors = load_file(state)
             own = {name: value for name, value in tensors.items() if not name.startswith(_AVERAGED)}
             self.net.load_state_dict(own)
@@ -94,15 +96,14 @@ class Training:
         self.seconds += time.process_time() - start
         return {"loss": float(loss.detach())} | {name: float(term.detach()) for name, term in terms.items()}
 
-    def write(self, out: Path, config: DictConfig, state: bool = True) -> None:
-        """Writes the averaged weights and, with ``state``, what training continues from, in half precision."""
+    def write(self, out: Path, config: DictConfig) -> None:
+        """Writes the averaged weights, and what training continues from, in half precision."""
         made_of = {"step": str(self.step), "seconds": f"{self.seconds:.0f}", "options": OmegaConf.to_yaml(config)}
         averaged = {name: value.half().contiguous() for name, value in self.averaged.items()}
         write_bytes(out / WEIGHTS, save(averaged, metadata=made_of))
-        if state:
-            own = {name: value.detach().half().contiguous() for name, value in self.net.state_dict().items()}
-            own |= {_AVERAGED + name: value for name, value in averaged.items()}
-            write_bytes(out / STATE, save(own, metadata=made_of))
+        own = {name: value.detach().half().contiguous() for name, value in self.net.state_dict().items()}
+        own |= {_AVERAGED + name: value for name, value in averaged.items()}
+        write_bytes(out / STATE, save(own, metadata=made_of | {"fallen": str(self.fallen)}))
 
 
 @hydra.main(config_path=".", config_name="train", version_base="1.3")
@@ -110,10 +111,14 @@ def main(config: DictConfig) -> None:
     """Trains for ``minutes``, or until the process is told to stop."""
     torch.set_num_threads(config.threads)
     torch.manual_seed(config.seed)
-    out = Path(config.out)
+    out = Path(config.out) / "cooled" if config.cooldown else Path(config.out)
     out.mkdir(parents=True, exist_ok=True)
-    begun = out / STATE if (out / STATE).is_file() else Path(config.begin) if config.begin else None
+    states = [out / STATE, Path(config.out) / STATE, *([Path(config.begin)] if config.begin else [])]
+    begun = next((file for file in states if file.is_file()), None)
+    if config.begin and begun is None:
+        raise FileNotFoundError(f"begin={config.begin} does not exist")
     training = Training(config.training, begun)
+    training.fallen = training.fallen if begun == out / STATE else 0  # another fall may have made what this begins with
     files = [file for part in config.scenes.parts for file in scene_files(config.scenes.folder, **part)]
     files = [file for file in files if file.is_file()] if config.scenes.rendered else files
     rooms = sorted(Path(config.infinigen.folder).glob("room_*.npz")) if config.infinigen.folder else []
@@ -124,21 +129,22 @@ def main(config: DictConfig) -> None:
         signal.signal(number, lambda *given: told.append(given[0]))
     start = written = time.monotonic()
     mean: dict[str, float] = {}
-    first, last = training.step, training.step + config.cooldown if config.cooldown else None
-    while not told and (config.cooldown or not config.minutes or time.monotonic() - start < 60 * config.minutes):
-        if training.step == last:
+    first = training.step
+    while not told and (not config.minutes or time.monotonic() - start < 60 * config.minutes):
+        if config.cooldown and training.fallen >= config.cooldown:
             break
-        factor = 1.0 if last is None else (last - training.step) / config.cooldown
+        factor = 1.0 - training.fallen / config.cooldown if config.cooldown else 1.0
         terms = training.update(samples[training.step], factor)
+        training.fallen += bool(config.cooldown)
         mean = {name: mean.get(name, term) + 0.02 * (term - mean.get(name, term)) for name, term in terms.items()}
         if training.step % 50 == 0:
             shown = " ".join(f"{name} {value:.4f}" for name, value in mean.items())
             rate = (time.monotonic() - start) / (training.step - first)
             print(f"{training.step} {rate:.2f} s/step {training.seconds / 3600:.2f} h {shown}", flush=True)
-        if not config.cooldown and time.monotonic() - written > 60 * config.save_minutes:
+        if time.monotonic() - written > 60 * config.save_minutes:
             training.write(out, config)
             written = time.monotonic()
-    training.write(out / "cooled" if config.cooldown else out, config, not config.cooldown)
+    training.write(out, config)
 
 
 if __name__ == "__main__":

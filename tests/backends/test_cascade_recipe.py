@@ -1,6 +1,8 @@
 """The recipe of the cascade's weights, and slim rooms."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +24,7 @@ from recipes.cascade.samples import CascadeSamples, Sample
 from recipes.infinigen.slim import VIEWS, choose, decode_depth, encode_depth, read_slim, write_slim
 from recipes.sweep.objective import cell_inverse
 from recipes.sweep.scenes import read_scene, scene_files
+from tests.commands import ROOT
 from tests.data.sources import layout_infinigen
 from tests.data.sources.layouts import room
 
@@ -138,10 +141,6 @@ def test_training_continues_from_its_state(scenes: list[Path], tmp_path: Path) -
     assert sum(not torch.equal(before[name], value) for name, value in training.net.state_dict().items()) > 100
     assert again.update(samples[2])["loss"] == pytest.approx(training.update(samples[2])["loss"], rel=0.05)
     CascadeBackend(path=str(tmp_path / WEIGHTS))
-    kept = (tmp_path / STATE).read_bytes()
-    training.write(tmp_path / "cooled", config, state=False)
-    assert (tmp_path / STATE).read_bytes() == kept
-    assert [path.name for path in (tmp_path / "cooled").iterdir()] == [WEIGHTS]
     with safe_open(tmp_path / STATE, "pt") as file:
         assert "rate: 0.001" in file.metadata()["options"]
 
@@ -189,6 +188,21 @@ def test_a_slim_room_is_read_as_it_was_written(tmp_path: Path) -> None:
     assert scene.depth[~shown].isinf().all()
     torch.testing.assert_close(scene.world_to_camera, truth.world_to_camera.float(), rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(scene.intrinsics, truth.intrinsics.float(), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_a_fall_of_the_rate_that_was_stopped_continues(scenes: list[Path], tmp_path: Path) -> None:
+    """Three steps, the first of them in a run that is stopped by its time."""
+    part = "scenes.parts=[{count: 2, first_seed: 5000000, size: [64, 128]}]"
+    common = [f"scenes.folder={scenes[0].parent}", part, f"out={tmp_path}", "samples.shapes=[[2,48,96,1]]"]
+    for options, begun, made in ((("minutes=0.0001",), 0, 1), ((), 1, 3)):
+        command = [sys.executable, "-m", "recipes.cascade", *common, "cooldown=3", *options]
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr[-3000:]
+        assert f"step {begun}, 2 scenes" in done.stdout
+        with safe_open(tmp_path / "cooled" / STATE, "pt") as file:
+            assert (file.metadata()["step"], file.metadata()["fallen"]) == (str(made), str(made))
+    assert not (tmp_path / STATE).exists()
 
 
 @pytest.mark.parametrize("place", [3.25, 19.25])
