@@ -32,6 +32,7 @@ from vg2gt.io.files import write_bytes
 
 _LARGEST_GRADIENT = 1.0
 _AVERAGED = "averaged."
+_PLACES = ("out", "begin")  # folders of one machine, which do not belong in its files
 STATE, WEIGHTS = "state.safetensors", "cascade.safetensors"
 
 
@@ -98,7 +99,8 @@ class Training:
 
     def write(self, out: Path, config: DictConfig) -> None:
         """Writes the averaged weights, and what training continues from, in half precision."""
-        made_of = {"step": str(self.step), "seconds": f"{self.seconds:.0f}", "options": OmegaConf.to_yaml(config)}
+        options = {name: value for name, value in config.items() if name not in _PLACES}
+        made_of = {"step": str(self.step), "seconds": f"{self.seconds:.0f}", "options": OmegaConf.to_yaml(options)}
         averaged = {name: value.half().contiguous() for name, value in self.averaged.items()}
         write_bytes(out / WEIGHTS, save(averaged, metadata=made_of))
         own = {name: value.detach().half().contiguous() for name, value in self.net.state_dict().items()}
