@@ -121,6 +121,8 @@ def main(config: DictConfig) -> None:
         raise FileNotFoundError(f"begin={config.begin} does not exist")
     training = Training(config.training, begun)
     training.fallen = training.fallen if begun == out / STATE else 0  # another fall may have made what this begins with
+    if config.cooldown and training.fallen >= config.cooldown:
+        raise ValueError(f"{out} holds a fall of {training.fallen} steps, which is over: choose another out=")
     files = [file for part in config.scenes.parts for file in scene_files(config.scenes.folder, **part)]
     files = [file for file in files if file.is_file()] if config.scenes.rendered else files
     rooms = sorted(Path(config.infinigen.folder).glob("room_*.npz")) if config.infinigen.folder else []
@@ -133,7 +135,7 @@ def main(config: DictConfig) -> None:
     mean: dict[str, float] = {}
     first = training.step
     while not told and (not config.minutes or time.monotonic() - start < 60 * config.minutes):
-        if config.cooldown and training.fallen >= config.cooldown:
+        if config.cooldown and training.fallen == config.cooldown:
             break
         factor = 1.0 - training.fallen / config.cooldown if config.cooldown else 1.0
         terms = training.update(samples[training.step], factor)

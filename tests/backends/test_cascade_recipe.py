@@ -131,9 +131,10 @@ def test_training_continues_from_its_state(scenes: list[Path], tmp_path: Path) -
     before = {name: value.clone() for name, value in training.net.state_dict().items()}
     terms = [training.update(samples[n]) for n in range(2)]
     assert all(np.isfinite(list(each.values())).all() for each in terms)
+    training.fallen = 1
     training.write(tmp_path, config)
     again = Training(config.training, tmp_path / STATE)
-    assert (again.step, again.here) == (2, 0)
+    assert (again.step, again.here, again.fallen) == (2, 0, 1)
     assert again.seconds == pytest.approx(training.seconds, abs=1)
     for name, value in training.net.state_dict().items():
         torch.testing.assert_close(again.net.state_dict()[name], value, rtol=1e-3, atol=1e-6)
@@ -192,7 +193,10 @@ def test_a_slim_room_is_read_as_it_was_written(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_fall_of_the_rate_that_was_stopped_continues(scenes: list[Path], tmp_path: Path) -> None:
-    """Three steps, the first of them in a run that is stopped by its time."""
+    """Three steps, the first of them in a run that is stopped by its time; the state that it began with stays."""
+    options = OmegaConf.create({"rate": 1e-3, "weight_decay": 0.02, "average": 0.5})
+    Training(options).write(tmp_path, OmegaConf.create())
+    kept = (tmp_path / STATE).read_bytes()
     part = "scenes.parts=[{count: 2, first_seed: 5000000, size: [64, 128]}]"
     common = [f"scenes.folder={scenes[0].parent}", part, f"out={tmp_path}", "samples.shapes=[[2,48,96,1]]"]
     for options, begun, made in ((("minutes=0.0001",), 0, 1), ((), 1, 3)):
@@ -202,7 +206,9 @@ def test_a_fall_of_the_rate_that_was_stopped_continues(scenes: list[Path], tmp_p
         assert f"step {begun}, 2 scenes" in done.stdout
         with safe_open(tmp_path / "cooled" / STATE, "pt") as file:
             assert (file.metadata()["step"], file.metadata()["fallen"]) == (str(made), str(made))
-    assert not (tmp_path / STATE).exists()
+    assert (tmp_path / STATE).read_bytes() == kept
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert "holds a fall of 3 steps, which is over: choose another out=" in done.stderr
 
 
 @pytest.mark.parametrize("place", [3.25, 19.25])
