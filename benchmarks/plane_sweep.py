@@ -1,9 +1,9 @@
 """Depth of the learned plane sweep: ``python benchmarks/plane_sweep.py``.
 
-Only cameras are given; the network finds the depth range. Scenes are procedural ones on which nothing was trained, with
-``--shared FOLDER`` also real recordings, and with ``--infinigen FOLDER`` rooms of Infinigen. ``--itermvs FOLDER`` runs
-IterMVS (``examples/backends``) on the same views, ``--cascade FILE`` the plane sweep in training (``recipes/cascade``),
-and ``--ckpt RUN`` the backbone of a trained model, before and after its coarse module.
+Only cameras are given. Scenes are procedural ones on which nothing was trained, with ``--shared FOLDER`` also real
+recordings, and with ``--infinigen FOLDER`` rooms of Infinigen. ``--itermvs FOLDER`` runs IterMVS
+(``examples/backends``) on the same views, and ``--ckpt RUN`` the backbone of a trained model, before and after its
+coarse module.
 Depth is compared after alignment by one median scale per set of views, except ``raw``. Prints a table and writes a
 dated JSON file.
 """
@@ -22,7 +22,6 @@ from common import machine, parser, write_results
 from hydra.utils import instantiate
 
 from backends.base import Backend
-from backends.cascade import CascadeBackend
 from backends.sweep import SweepBackend
 from examples.backends.itermvs import IterMVSBackend
 from vg2gt import __version__
@@ -115,7 +114,6 @@ def main() -> None:
     arguments.add_argument("--weights", help="safetensors file instead of the shipped weights")
     arguments.add_argument("--scenes", type=int, default=16, help="number of procedural scenes of a kind")
     arguments.add_argument("--itermvs", type=Path, help="checkout of FangjinhuaWang/IterMVS: measures it as well")
-    arguments.add_argument("--cascade", help="weights of the cascade: measures it as well")
     arguments.add_argument("--ckpt", help="run: measures its backbone, and the depth after its coarse module, as well")
     options = arguments.parse_args()
     torch.set_num_threads(1)
@@ -124,8 +122,6 @@ def main() -> None:
     if options.itermvs:
         weights = options.itermvs / "checkpoints/blendedmvs/model_000015.ckpt"
         backends[", IterMVS"] = IterMVSBackend(path=str(weights))
-    if options.cascade:
-        backends[", cascade"] = CascadeBackend(path=options.cascade)
     predictors = {suffix: of_backbone(network) for suffix, network in backends.items()}
     if options.ckpt:
         model = load_model(options.ckpt, device="cpu").model

@@ -176,7 +176,7 @@ def test_every_ablation_builds_what_it_says(tmp_path: Path, ablation: str) -> No
 DEFAULTS: dict[str, dict[str, Any]] = {
     "vg2gt.model.SceneScale": {"median_depth": 1.0},
     "vg2gt.visibility.ViewCheck": {
-        "rounds": 2, "partners": 24, "fine_below": 1.4, "coarsest": 2.0, "moved_margin": 0.08,
+        "rounds": 2, "partners": 24, "fine_below": 1.4, "coarsest": 1.4, "moved_margin": 0.08,
     },
     "vg2gt.method.CoarseModule": {"neighbors": 16, "inject": "all", "upsample": 2},
     "vg2gt.method.PTv3": {"window": 64, "norm": "layer", "legacy": False},
@@ -212,7 +212,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "backends.oracle.OracleBackend": {
         "patch_size": 14, "dim": 64, "taps": 4, "pose_noise": None, "response": 0.02, "seed": 0,
     },
-    "backends.sweep.SweepBackend": {"sources": 3, "seed": 0},
+    "backends.sweep.SweepBackend": {"seed": 0},
     "backends.da3.DA3Backend": {"reference_view": "first", "revision": None, "seed": 0},
     "backends.da3.DA3MetricBackend": {"revision": None, "seed": 0},
     "backends.vggt.VGGTBackend": {"revision": None, "seed": 0},

@@ -1,4 +1,4 @@
-"""Image features of the plane sweep: matching features (unit length per group) and context, at two resolutions."""
+"""Image features of the plane sweep: matching features (unit length per group) at 1/8 to 1/2, and context."""
 
 from __future__ import annotations
 
@@ -10,22 +10,20 @@ from torch.nn import functional as F
 
 from backends.sweep.correlate import GROUPS
 
-MATCH_COARSE, _MATCH_FINE = 32, 32  # matching channels at 1/4 and 1/2 of the image
+_MATCH = 32  # matching channels
 CONTEXT_COARSE, CONTEXT_FINE = 48, 16
 
 
 class Features(NamedTuple):
-    """Features of N images; ``h, w`` is 1/4 of the image size.
+    """Features of N images; ``h, w`` is 1/8 of the image size.
 
     Attributes:
-        coarse: matching features ``[N, MATCH_COARSE, h, w]``, each group of channels of unit length.
-        fine: matching features ``[N, _MATCH_FINE, 2 h, 2 w]``, each group of channels of unit length.
-        context: ``[N, CONTEXT_COARSE, h, w]``.
-        context_fine: ``[N, CONTEXT_FINE, 2 h, 2 w]``.
+        match: matching features at 1/8, 1/4 and 1/2, each group of channels of unit length.
+        context: ``[N, CONTEXT_COARSE, 2 h, 2 w]``.
+        context_fine: ``[N, CONTEXT_FINE, 4 h, 4 w]``.
     """
 
-    coarse: Tensor
-    fine: Tensor
+    match: tuple[Tensor, Tensor, Tensor]
     context: Tensor
     context_fine: Tensor
 
@@ -84,26 +82,25 @@ class FeaturePyramid(nn.Module):
         self.from_quarter = nn.Conv2d(48, 32, 1)
         self.merge = conv_norm(48, 48)
         self.merge_half = conv_norm(32, 32)
-        self.coarse = nn.Conv2d(48, MATCH_COARSE, 3, 1, 1)
-        self.fine = nn.Conv2d(32, _MATCH_FINE, 3, 1, 1)
+        self.eighth = nn.Conv2d(64, _MATCH, 3, 1, 1)
+        self.coarse = nn.Conv2d(48, _MATCH, 3, 1, 1)
+        self.fine = nn.Conv2d(32, _MATCH, 3, 1, 1)
         # no ReLU: it can die in the first steps, and the context with it
         self.context = conv_norm(48, CONTEXT_COARSE, relu=False)
         self.context_fine = conv_norm(32, CONTEXT_FINE, relu=False)
 
-    def pyramid(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Returns feature maps of 32, 48 and 64 channels at 1/2, 1/4 and 1/8 of images; see :meth:`forward`."""
+    def forward(self, images: Tensor) -> Features:
+        """Extracts features of images ``[N, 3, H, W]`` in [0, 1]; H and W multiples of 8."""
         half = self.to_half((images - 0.5) * 3)
         quarter = self.to_quarter(half)
         eighth = self.to_eighth(quarter)
         eighth = F.relu(eighth + upsample(self.from_sixteenth(self.to_sixteenth(eighth)), eighth))
         quarter = self.merge(quarter + upsample(self.from_eighth(eighth), quarter))
-        return self.merge_half(half + upsample(self.from_quarter(quarter), half)), quarter, eighth
-
-    def forward(self, images: Tensor) -> Features:
-        """Extracts features of images ``[N, 3, H, W]`` in [0, 1]; H and W multiples of 8."""
-        half, quarter, _ = self.pyramid(images)
-        matching = (unit_groups(self.coarse(quarter)), unit_groups(self.fine(half)))
-        return Features(*matching, self.context(quarter), self.context_fine(half))
+        half = self.merge_half(half + upsample(self.from_quarter(quarter), half))
+        coarse = unit_groups(self.coarse(quarter))
+        pooled = unit_groups(F.avg_pool2d(coarse, 2) + self.eighth(eighth))
+        match = (pooled, coarse, unit_groups(self.fine(half)))
+        return Features(match, self.context(quarter), self.context_fine(half))
 
 
 def unit_groups(x: Tensor) -> Tensor:

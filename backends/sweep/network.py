@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -9,30 +10,27 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from backends.sweep.correlate import SourceWarp
-from backends.sweep.features import CONTEXT_COARSE, FeaturePyramid, Features, unit_groups
-from backends.sweep.refine import DepthHead, RefineNet, convex_upsample, slices
-from backends.sweep.tokens import PATCH, TokenNet, patch_places
-from backends.sweep.views import agreed_range, choose_sources, view_ranges, wide_range
-from backends.sweep.volume import (
-    PlaneSweep,
-    VolumeNet,
-    agreement,
-    chunks_of_views,
-    expectation,
-    near_and_far,
-    to_inverse,
-)
+from backends.sweep.features import CONTEXT_COARSE, FeaturePyramid, Features
+from backends.sweep.planes import FARTHEST, Planes, baselines, fine_sources
+from backends.sweep.refine import CELLS, DepthHead, PlainBlock, RefineNet, activate, convex_upsample, slices
+from backends.sweep.stage import Matching, Stage
+from backends.sweep.tokens import DIM, PATCH, POSITION_CHANNELS, TAPS, TokenBlock, attend, patch_places
+from backends.sweep.views import relative_poses
+from backends.sweep.volume import agreement
 from vg2gt.geometry.cameras import resize_intrinsics
 from vg2gt.geometry.precision import full_precision
 
+PLANES = 64
+_SPACING = 1 / (PLANES - 1)
+_QUARTER, _HALF = (16, 0.25 * _SPACING), (8, 0.1 * _SPACING)  # planes of a row, and spacing, of the later stages
+ROWS = (1, 2, 1)  # rows of planes of the stages
+_OTHER = 3 * _SPACING  # distance from a centre from which on a plane of the first stage counts as another answer
+_CHANNELS = (16, 16, 8)  # of the regularisation of each stage
+_AGREEMENT = (0.1, 0.05)  # widths of the agreement at 1/8 and 1/4
+_FARTHEST_MATCHED, _BEYOND = 0.95, 1.5  # quantile of the matched depth of a scene, and the greatest depth over it
 _BINS = 16  # channels that hold the summed probability of the planes
-_FINE_PLANES = 12
-_FINE_REACH = 1.5  # reach of the second sweep on either side, in plane spacings of the first
-_FARTHEST = 4.0  # maximum swept depth, in multiples of the farthest plane
-_WIDE_PLANES = 64  # planes of the sweeps that find the range
-_BEYOND = (0.5, 3.0)  # factors on near and far of a hint: the range to search
-_RANGE_CELLS = 2000  # maximum cells per feature map in these sweeps
-_NEARER = 0.6  # near of the second of these sweeps, relative to the near that the first found
+_STATED = 1 + 1 + 3 + _BINS  # relative log-depth, mass, agreement, bins
+_SEEN = 32  # channels of the U-Net that the tokens see
 
 
 class PosedViews(NamedTuple):
@@ -62,22 +60,6 @@ class PosedViews(NamedTuple):
             return SourceWarp(self.world_to_camera, intrinsics, sources, (maps.shape[-2], maps.shape[-1]))
 
 
-class Sweep(NamedTuple):
-    """Result of one sweep.
-
-    Attributes:
-        logits: logits of the planes ``[V, D, h, w]``.
-        position: positions of the planes, ``[V, D, h, w]`` or broadcastable; 0 is far, 1 is near.
-        t: expected position ``[V, 1, h, w]``.
-        mass: probability mass around it ``[V, 1, h, w]``.
-    """
-
-    logits: Tensor
-    position: Tensor
-    t: Tensor
-    mass: Tensor
-
-
 class SweepEncoding(NamedTuple):
     """Intermediate results between images and depth; ``h, w`` is 1/4 of the image size.
 
@@ -85,151 +67,208 @@ class SweepEncoding(NamedTuple):
         taps: patch tokens ``[V, P, DIM]`` of the last blocks.
         context: ``[V, C, h, w]``.
         context_fine: ``[V, C, 2 h, 2 w]``.
-        swept: log-depth of the second sweep and its probability, ``[V, 2, 2 h, 2 w]``.
-        first: first sweep.
-        refined: position after the U-Net ``[V, 1, h, w]``.
-        center: the same upsampled to ``[V, 1, 2 h, 2 w]``; the second sweep searches around it.
-        second: second sweep.
+        swept: log-depth of the last stage, its probability, that at 1/4 and the share of the matched depth in what the
+            stages are centred on, ``[V, 4, 2 h, 2 w]``.
+        origin: first channels of the last tap, for which decoding adds no direct correction, ``[V, P, 4]``.
+        stages: the three stages, at 1/8, 1/4 and 1/2 of the image.
+        guess: log-depth of the monocular branch at 1/8.
+        centers: log-depth on which each stage but the first is centred, at 1/8 (matched or guessed), 1/4 and 1/2.
     """
 
     taps: tuple[Tensor, ...]
     context: Tensor
     context_fine: Tensor
     swept: Tensor
-    first: Sweep
-    refined: Tensor
-    center: Tensor
-    second: Sweep
+    origin: Tensor
+    stages: tuple[Stage, ...]
+    guess: Tensor
+    centers: tuple[Tensor, ...]
 
 
 class SweepNet(nn.Module):
-    """Learned plane sweep: a wide sweep at 1/4, a U-Net, a narrow sweep at 1/2, tokens of 8x8 patches, a depth head."""
+    """Matches at 1/8 over all depths, fills in what does not match, and matches twice more around that."""
 
     def __init__(self) -> None:
         super().__init__()
         self.features = FeaturePyramid()
-        self.sweep = PlaneSweep()
-        self.volume = VolumeNet()
-        self.refine = RefineNet(CONTEXT_COARSE + 1 + 1 + 3 + _BINS, 1 + 36)  # outputs position and upsampling mask
-        self.sweep_fine = PlaneSweep()
-        self.volume_fine = VolumeNet()
-        per_cell = CONTEXT_COARSE + 2 + 3  # context, refined position and first sweep's mass, agreement
-        self.tokens = TokenNet(4 * per_cell + 16 * 2 + _BINS)
+        self.matching = nn.ModuleList(Matching(channels, level == 0) for level, channels in enumerate(_CHANNELS))
+        self.refine = RefineNet(CONTEXT_COARSE + _STATED, 3 + 36 + _SEEN)
+        self.embed = nn.Sequential(
+            nn.Linear(4 * CONTEXT_COARSE + _STATED + 3 + _SEEN, 2 * DIM), nn.GELU(), nn.Linear(2 * DIM, DIM)
+        )
+        self.position = nn.Linear(POSITION_CHANNELS, DIM)
+        self.blocks = nn.ModuleList(TokenBlock(DIM, 4, i % 2 == 1, 2 + 2 * (i % 2)) for i in range(4))
+        self.fill = nn.Linear(DIM, 2)
+        self.begin = nn.Conv2d(CONTEXT_COARSE + 6, 48, 3, 1, 1)
+        self.block = PlainBlock(48)
+        self.end = nn.Conv2d(48, 1 + 36, 3, 1, 1)
+        self.embed_fine = nn.Sequential(nn.Linear(4 * 6 + 16 * 2, 2 * DIM), nn.GELU(), nn.Linear(2 * DIM, DIM))
         self.head = DepthHead()
-
-    def coarse(
-        self, maps: Tensor, views: PosedViews, depth_range: Tensor, sources: Tensor, planes: int, stride: int = 4
-    ) -> tuple[Sweep, Tensor]:
-        """Sweeps feature maps over a depth range.
-
-        Args:
-            maps: matching features ``[V, C, h, w]``.
-            views: the views.
-            depth_range: near and far, ``[2]`` or ``[V, 2]``.
-            sources: indices of the sources ``[V, n]``.
-            planes: number of planes.
-            stride: image size over map size.
-
-        Returns:
-            The sweep, and the :func:`agreement` of its depths ``[V, 3, h, w]``.
-        """
-        warp = views.warp(maps, sources, stride)
-        position = torch.linspace(0, 1, planes, device=depth_range.device).view(1, -1, 1, 1)
-        inverse = to_inverse(position, depth_range)[..., 0].expand(len(views.images), -1, -1)  # [V, D, 1]
-        logits = _match(self.sweep, self.volume, maps, inverse, warp)
-        t, mass = expectation(logits, position)
-        agreeing = agreement(to_inverse(t.detach(), depth_range), warp)
-        return Sweep(logits, position, t, mass), agreeing
-
-    def find_range(self, features: Features, views: PosedViews, sources: int, hint: Tensor | None = None) -> Tensor:
-        """Finds the range of depths of every view, from those on which views agree in wide sweeps at low resolution.
-
-        A hint is searched beyond its limits, as sparse points lie on texture and miss near surfaces that few views see.
-        Without a hint, a first sweep finds near, and a second sweep starts there so that its planes resolve far.
-
-        Args:
-            features: features of ``views.images``.
-            views: views of one scene.
-            sources: number of views that each view is matched with.
-            hint: known near and far ``[2]``; None searches a range derived from the cameras.
-
-        Returns:
-            Near and far ``[V, 2]``, including the hint if there is one; see :func:`view_ranges`. If hardly any depth
-            agrees, they are those of the hint or the searched range.
-        """
-        maps, stride = features.coarse, 4
-        while maps.shape[-2] * maps.shape[-1] > _RANGE_CELLS:
-            maps, stride = unit_groups(F.avg_pool2d(maps, 2)), 2 * stride
-
-        def search(wide: Tensor, fallback: Tensor, least: float = 0.0) -> Tensor:
-            """Agreed range of one sweep; ignores positions below ``least`` (0 is far, 1 is near)."""
-            chosen = choose_sources(views.world_to_camera, views.intrinsics, views.size, wide, sources)
-            sweep, agreeing = self.coarse(maps, views, wide, chosen, _WIDE_PLANES, stride)
-            counts = (sweep.mass > 0.4) & (sweep.t >= least)
-            return agreed_range(1 / to_inverse(sweep.t, wide), agreeing[:, 1:2] * counts, fallback)
-
-        beyond = 1 / (_WIDE_PLANES - 1)  # sky and windows agree at any large depth, between the last two planes
-        if hint is not None:
-            found = search(hint * hint.new_tensor(_BEYOND), hint, least=beyond)
-            found = torch.stack((torch.minimum(found[0], hint[0]), torch.maximum(found[1], hint[1])))
-        else:
-            wide = wide_range(views.world_to_camera)
-            first = search(wide, wide)
-            found = search(torch.stack((_NEARER * first[0], wide[1])), first, least=beyond)
-        return view_ranges(views.world_to_camera, views.intrinsics, views.size, found)
+        self.other = nn.Linear(3, 1)  # logit of the other answer at 1/4, from the probabilities of both and the share
+        self.gate = nn.Parameter(torch.tensor([-3.0, 4.0, 8.0]))  # bias, mass, mass times greatest agreement
+        for layer in (self.fill, self.end, self.embed_fine[2]):
+            nn.init.zeros_(layer.weight)  # pyright: ignore[reportArgumentType]
+            nn.init.zeros_(layer.bias)  # pyright: ignore[reportArgumentType]
+        nn.init.zeros_(self.other.weight)
+        nn.init.constant_(self.other.bias, -1.0)
 
     def encode(
-        self, features: Features, views: PosedViews, depth_range: Tensor, sources: Tensor, planes: int
+        self, features: Features, views: PosedViews, sources: Tensor, shown: Tensor | None = None
     ) -> SweepEncoding:
         """Encodes images as tokens.
 
         Args:
             features: features of ``views.images``.
             views: views of one or more scenes.
-            depth_range: near and far of the planes ``[2]``, or ``[V, 2]`` if scenes differ.
-            sources: indices of the sources of each view ``[V, n]``.
-            planes: number of planes of the first sweep.
+            sources: indices of the sources of each view at 1/8 ``[V, n]``.
+            shown: 0 where a view is matched with no source (training), else 1, ``[V, 1, H / 8, W / 8]``.
         """
-        # first sweep at 1/4, refined by the U-Net: [V, 1, h, w]
-        first, agreeing = self.coarse(features.coarse, views, depth_range, sources, planes)
+        unit = baselines(views.world_to_camera, views.scenes)
+        planes = Planes(unit)
+        # all depths at 1/8
+        warp = views.warp(features.match[0], sources, 8)
+        position = torch.linspace(0, 1, PLANES, device=unit.device).view(1, -1, 1, 1).expand(len(unit), -1, -1, -1)
+        first, visible = self.matching[0](features.match[0], position, planes, warp, None, shown)
+        matched = -planes.inverse(first.t).log()
+        agreeing = agreement((-matched).exp().detach(), warp, _AGREEMENT[0])
+        if shown is not None:
+            agreeing = agreeing * shown
+        reliable = first.mass.detach() * agreeing[:, 1:2]
+        scale = _scene_quantile(matched.detach(), reliable, views.scenes, 0.5)  # [V, 1, 1, 1]
+        farthest = _scene_quantile(matched.detach(), reliable, views.scenes, _FARTHEST_MATCHED) + math.log(_BEYOND)
+        # what does not match is filled in: U-Net, then attention
         bins = slices(first.logits.softmax(1), _BINS)
-        known = torch.cat((features.context, 4 * first.t, first.mass, agreeing, bins), 1)
-        found = self.refine(known)
-        refined = first.t + 0.25 * found[:, :1]
-        # second sweep at 1/2: [V, ., 2 h, 2 w]
-        center = convex_upsample(refined, found[:, 1:])  # bilinear would place it between the two sides of an edge
-        second = self._narrow(features.fine, center.detach(), views, depth_range, sources, planes)
-        inverse = to_inverse(second.t, depth_range).clamp_min(1 / (_FARTHEST * near_and_far(depth_range)[1]))
-        swept = torch.cat((-inverse.log(), second.mass), 1)
-        # patch features and tokens: [V, P, .]
+        stated = torch.cat((matched - scale, first.mass, agreeing, bins), 1)
+        found = self.refine(torch.cat((F.avg_pool2d(features.context, 2), stated), 1))
+        change, mask, seen = found[:, :3], found[:, 3:39], found[:, 39:]
         grid = (views.size[0] // PATCH, views.size[1] // PATCH)
-        cells = torch.cat((features.context, 4 * refined, first.mass, agreeing), 1)
-        parts = (F.pixel_unshuffle(cells, 2), F.pixel_unshuffle(torch.cat((4 * second.t, second.mass), 1), 4))
-        patches = torch.cat((*parts, F.avg_pool2d(bins, 2)), 1).flatten(2).mT  # [V, P, .]
-        depth = F.avg_pool2d(-swept[:, :1], 4).exp().flatten(1).reciprocal()
-        with full_precision(depth):
-            cameras = (views.world_to_camera, views.intrinsics)
-            place = patch_places(depth.detach(), *cameras, depth_range, grid, views.scenes)
-        taps = self.tokens(patches, place, grid, views.scenes)
-        return SweepEncoding(taps, features.context, features.context_fine, swept, first, refined, center, second)
+        patches = torch.cat((F.pixel_unshuffle(features.context, 2), stated, change, seen), 1)
+        tokens = self.embed(patches.flatten(2).mT)
+        sure = torch.stack((torch.ones_like(first.mass), first.mass, first.mass * agreeing[:, 1:2]), -1) @ self.gate
+
+        def blend(change: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            """Log-depth, matched or guessed, the guess, and the share of the matched one."""
+            guess = scale + change[:, 1:2]
+            share = torch.sigmoid(sure + change[:, 2:])
+            center = share * (matched + 0.1 * change[:, :1]) + (1 - share) * guess
+            if (
+                not torch.is_grad_enabled()
+            ):  # walls without texture were taken for sky in rooms unlike those of training
+                center = torch.minimum(center, farthest)
+            return center, guess, share
+
+        place = self._places(blend(change)[0], scale, views, grid)
+        tokens = attend(self.blocks[:2], tokens, place, grid, views.scenes)[-1]
+        filled = F.pad(self.fill(tokens).mT.unflatten(-1, grid), (0, 0, 0, 0, 1, 0))
+        center, guess, share = blend(change + filled)
+        # twice more, around that, with the best sources
+        parallax = relative_poses(views.world_to_camera, sources)[..., :3, 3].norm(dim=-1)  # [V, n]
+        parallax = parallax[..., None] * (-center.detach()).exp().flatten(1)[:, None]
+        chosen = fine_sources(visible.detach().flatten(2), parallax)
+        best = sources.gather(1, chosen)
+        visible = visible.detach().gather(1, chosen[:, :, None, None].expand(-1, -1, *visible.shape[2:]))
+        quarter = convex_upsample(center, mask)
+        warp = views.warp(features.match[1], best, 4)
+        second, visible = self._quarter(quarter, first, share, features, planes, warp, visible)
+        log_depth = -planes.inverse(second.t).log()
+        agreeing = agreement((-log_depth).exp().detach(), warp, _AGREEMENT[1])
+        known = torch.cat((log_depth - scale, second.mass, agreeing, log_depth - quarter), 1)
+        found = self.begin(torch.cat((features.context, known), 1))
+        found = self.end(activate(self.block(found))).float()
+        half = convex_upsample(log_depth + 0.1 * found[:, :1], found[:, 1:])
+        third, _ = self._narrow(2, half, _HALF, features, planes, views.warp(features.match[2], best, 2), visible)
+        log_depth = -planes.inverse(third.t).log()
+        fine = F.pixel_unshuffle(torch.cat((log_depth - scale, third.mass), 1), 4)
+        tokens = tokens + self.embed_fine(torch.cat((F.pixel_unshuffle(known, 2), fine), 1).flatten(2).mT)
+        place = self._places(F.avg_pool2d(log_depth, 4), scale, views, grid)
+        taps = attend(self.blocks[2:], tokens, place, grid, views.scenes)
+        sure = F.interpolate(torch.cat((F.avg_pool2d(second.mass, 2), share), 1), size=log_depth.shape[-2:])
+        swept = torch.cat((log_depth, third.mass, sure), 1)
+        stages, centers = (first, second, third), (center, quarter, half)
+        return SweepEncoding(
+            tuple(tap.float() for tap in taps[-TAPS:]),
+            features.context,
+            features.context_fine,
+            swept,
+            taps[-1][..., : CELLS**2].float(),
+            stages,
+            guess,
+            centers,
+        )
+
+    def _quarter(
+        self,
+        center: Tensor,
+        first: Stage,
+        share: Tensor,
+        features: Features,
+        planes: Planes,
+        warp: SourceWarp,
+        visible: Tensor,
+    ) -> tuple[Stage, Tensor]:
+        """The stage at 1/4, on two rows of planes: around ``center``, and around the likeliest plane not near it.
+
+        At 1/8 a thin object shares its cell with what is behind it, and a wrong guess may replace a right match.
+
+        Args:
+            center: log-depth ``[V, 1, h, w]``.
+            first: the stage at 1/8.
+            share: share of the matched depth in ``center``, ``[V, 1, h / 2, w / 2]``.
+            features: features of all views.
+            planes: unit of their planes.
+            warp: correspondences with the best sources.
+            visible: visibility of the pixels in them ``[V, n, h / 2, w / 2]``.
+
+        Returns:
+            The stage, with the planes of both rows, and the visibility ``[V, n, h, w]``.
+        """
+        likely = F.interpolate(first.logits.detach().softmax(1), size=center.shape[-2:], mode="nearest")
+        near = (first.position - planes.position(center.detach())).abs() <= _OTHER  # [V, PLANES, h, w]
+        best, index = likely.masked_fill(near, 0).max(1, keepdim=True)
+        other = -planes.inverse(index / (PLANES - 1)).log()
+        share = F.interpolate(share.detach(), size=center.shape[-2:], mode="nearest")
+        known = torch.cat((best, (likely * near).sum(1, keepdim=True), share), 1)
+        bias = self.other(known.movedim(1, -1)).movedim(-1, 1)  # [V, 1, h, w]
+        one, kept = self._narrow(1, center, _QUARTER, features, planes, warp, visible)
+        two, _ = self._narrow(1, other, _QUARTER, features, planes, warp, visible)
+        logits = torch.cat((one.logits, two.logits + bias), 1)
+        # the depth is that of the row with the likelier peak, so that the two are never averaged
+        is_other = two.logits.amax(1, keepdim=True) + bias > one.logits.amax(1, keepdim=True)
+        shares = logits.unflatten(1, (2, -1)).logsumexp(2).softmax(1)  # [V, 2, h, w]
+        mass = torch.where(is_other, two.mass * shares[:, 1:], one.mass * shares[:, :1])
+        position = torch.cat((one.position, two.position), 1)
+        return Stage(logits, position, torch.where(is_other, two.t, one.t), mass), kept
 
     def _narrow(
-        self, fine: Tensor, center: Tensor, views: PosedViews, depth_range: Tensor, sources: Tensor, planes: int
-    ) -> Sweep:
-        """Second sweep, at 1/2 of the image, around the positions ``center [V, 1, 2 h, 2 w]``."""
-        warp = views.warp(fine, sources, 2)
-        reach = _FINE_REACH / (planes - 1)
-        offsets = torch.linspace(-reach, reach, _FINE_PLANES, device=fine.device).view(1, -1, 1, 1)
-        position = center + offsets  # [V, D, 2 h, 2 w]
-        least = 1 / (_FARTHEST * near_and_far(depth_range)[1])
-        inverse = to_inverse(position, depth_range).clamp_min(least).flatten(2)
-        logits = _match(self.sweep_fine, self.volume_fine, fine, inverse, warp)
-        t, mass = expectation(logits, position)
-        return Sweep(logits, position, t, mass)
+        self,
+        level: int,
+        center: Tensor,
+        spaced: tuple[int, float],
+        features: Features,
+        planes: Planes,
+        warp: SourceWarp,
+        visible: Tensor,
+    ) -> tuple[Stage, Tensor]:
+        """A stage on planes around the log-depth ``center``; ``visible`` is at half its resolution."""
+        count, spacing = spaced
+        offsets = torch.arange(count, device=center.device).view(1, -1, 1, 1) - (count - 1) / 2
+        position = (planes.position(center.detach()) + spacing * offsets).clamp_min(FARTHEST)
+        visible = F.interpolate(visible, size=center.shape[-2:], mode="nearest")
+        return self.matching[level](features.match[level], position, planes, warp, visible)
+
+    def _places(self, log_depth: Tensor, scale: Tensor, views: PosedViews, grid: tuple[int, int]) -> Tensor:
+        """Embedded positions of the patches, at the given log-depth, in units of the scene's matched depth."""
+        depth, unit = log_depth.detach().flatten(1).exp(), scale.flatten().exp()
+        with full_precision(depth):
+            cameras = (views.world_to_camera, views.intrinsics)
+            place = patch_places(depth, *cameras, unit, grid, views.scenes)
+        return self.position(place)
 
 
-def _match(sweep: PlaneSweep, volume: VolumeNet, features: Tensor, inverse: Tensor, warp: SourceWarp) -> Tensor:
-    """Logits of the planes ``[V, D, h, w]``; without gradients, in chunks of a few views to save memory."""
-    views, planes = inverse.shape[:2]
-    parts = chunks_of_views(views)
-    return torch.cat([volume(sweep(features, inverse[part], warp.select(part)), planes) for part in parts])
+def _scene_quantile(log_depth: Tensor, weight: Tensor, scenes: int, share: float) -> Tensor:
+    """Weighted quantile of the log-depth of each scene, ``[V, 1, 1, 1]``."""
+    views = len(log_depth) // scenes
+    values, order = log_depth.reshape(scenes, -1).sort(1)
+    mass = (weight.reshape(scenes, -1) + 1e-4).gather(1, order).cumsum(1)
+    place = (mass < share * mass[:, -1:]).sum(1, keepdim=True)
+    return values.gather(1, place).repeat_interleave(views, 0).view(-1, 1, 1, 1)

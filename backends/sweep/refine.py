@@ -1,4 +1,4 @@
-"""Networks that refine depth: a U-Net after the first sweep, and the depth head, differentiable in the tokens."""
+"""Networks that refine depth: a U-Net after the first stage, and the depth head, differentiable in the tokens."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from backends.sweep.features import CONTEXT_COARSE, CONTEXT_FINE, upsample
 from backends.sweep.tokens import DIM, TAPS
 
 RESPONSE = 0.02  # change of log-depth per unit of the tokens' correction channels
+_SWEPT = 4  # channels of the last stage that the head reads
 CELLS = 2  # the correction channels hold CELLS x CELLS values per patch
 _SPREAD = 48  # channels per cell after the tokens are spread over the cells
 _UNSURE = -2.5  # log-scale of the relative error before training
@@ -37,7 +38,7 @@ class PlainBlock(nn.Module):
 
 
 class RefineNet(nn.Module):
-    """U-Net at 1/4, 1/8 and 1/16 of the image that fills in depth where matching fails (bare walls, occlusions).
+    """U-Net at 1/8, 1/16 and 1/32 of the image that fills in depth where matching fails (bare walls, occlusions).
 
     Its outputs are zero before training.
     """
@@ -84,22 +85,20 @@ def slices(probability: Tensor, bins: int) -> Tensor:
 
 
 class DepthHead(nn.Module):
-    """Predicts depth: log-depth is that of the sweep plus two corrections.
+    """Predicts depth: log-depth is that of the last stage plus two corrections.
 
-    The first correction is linear: the first four channels of the last tap, one per 2x2 cell of the patch, times
-    ``RESPONSE``. It makes depth change smoothly with the tokens. The second is predicted from all taps by convolutions.
-
-    Args:
-        stated: channels of ``swept``.
+    The first correction is linear: how far the first four channels of the last tap, one per 2x2 cell of the patch, have
+    moved, times ``RESPONSE``. It makes depth change smoothly with the tokens. The second is predicted from all taps by
+    convolutions.
     """
 
-    def __init__(self, stated: int = 2) -> None:
+    def __init__(self) -> None:
         super().__init__()
         self.norms = nn.ModuleList(nn.LayerNorm(DIM) for _ in range(TAPS))
         self.spread = nn.Linear(TAPS * DIM, CELLS**2 * _SPREAD)
         self.coarse = nn.Sequential(nn.Conv2d(_SPREAD + CONTEXT_COARSE, 64, 3, 1, 1), PlainBlock(64), PlainBlock(64))
         self.lift = nn.Conv2d(64, 48, 1)
-        self.fine = nn.Sequential(nn.Conv2d(48 + CONTEXT_FINE + stated, 48, 3, 1, 1), PlainBlock(48))
+        self.fine = nn.Sequential(nn.Conv2d(48 + CONTEXT_FINE + _SWEPT, 48, 3, 1, 1), PlainBlock(48))
         self.out = nn.Conv2d(48, 2, 3, 1, 1)
         self.mask = nn.Sequential(nn.Conv2d(48, 64, 1), nn.ReLU(), nn.Conv2d(64, 9 * 4, 1))
         nn.init.zeros_(self.out.weight)
@@ -111,7 +110,7 @@ class DepthHead(nn.Module):
         context: Tensor,
         context_fine: Tensor,
         swept: Tensor,
-        origin: Tensor | None = None,
+        origin: Tensor,
     ) -> tuple[Tensor, Tensor]:
         """Decodes depth and the log-scale of its relative error, each ``[V, 4 h, 4 w]``.
 
@@ -119,18 +118,17 @@ class DepthHead(nn.Module):
             taps: tokens ``[V, P, DIM]`` of each tap.
             context: ``[V, CONTEXT_COARSE, h, w]``, at 1/4 of the image.
             context_fine: ``[V, CONTEXT_FINE, 2 h, 2 w]``.
-            swept: log-depth of the sweep, its probability and further channels, ``[V, stated, 2 h, 2 w]``.
-            origin: the first four channels of the last tap for which the first correction is zero ``[V, P, 4]``; None:
-                zero.
+            swept: log-depth of the last stage and three channels on its reliability, ``[V, 4, 2 h, 2 w]``.
+            origin: the first four channels of the last tap for which the first correction is zero ``[V, P, 4]``.
         """
         grid = (context.shape[-2] // CELLS, context.shape[-1] // CELLS)
         # tokens to cells of half a patch: [V, P, DIM] to [V, C, h, w]
         said = torch.cat([norm(tap) for norm, tap in zip(self.norms, taps, strict=True)], -1)
         said = F.pixel_shuffle(self.spread(said).mT.unflatten(-1, grid), CELLS)  # [V, C, h, w]
-        correction = taps[-1][..., : CELLS**2] - (0 if origin is None else origin)
+        correction = taps[-1][..., : CELLS**2] - origin
         correction = F.pixel_shuffle(correction.mT.unflatten(-1, grid), CELLS)
         x = self.lift(activate(self.coarse(torch.cat((said, context), 1))))
-        # to the sweep's resolution: [V, ., 2 h, 2 w]
+        # to the last stage's resolution: [V, ., 2 h, 2 w]
         x, correction = (upsample(each, swept) for each in (x, correction))
         center = swept[:, :1].mean((-1, -2), keepdim=True)
         x = activate(self.fine(torch.cat((x, context_fine, swept[:, :1] - center, swept[:, 1:]), 1)))

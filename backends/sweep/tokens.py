@@ -1,4 +1,4 @@
-"""Patch tokens of the plane sweep: embeds 8x8 patches and attends within and across views."""
+"""Patch tokens of the plane sweep: attention of 8x8 patches within and across views, and their positions."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vg2gt.geometry.cameras import resize_intrinsics
 PATCH = 8
 DIM = 128
 TAPS = 2  # outputs of the last two blocks
-_WAVENUMBERS = (1.5, 4.0, 10.0)  # of 3D position encodings, in units of one over the geometric-mean depth
+_WAVENUMBERS = (1.5, 4.0, 10.0)  # of 3D position encodings, in units of one over the unit of length
 _IMAGE_WAVES = 8
 POSITION_CHANNELS = 3 + 3 + 6 * len(_WAVENUMBERS) + 4 * _IMAGE_WAVES
 
@@ -62,33 +62,11 @@ def attend(
     return tuple(outputs)
 
 
-class TokenNet(nn.Module):
-    """Embeds patches of ``inputs`` channels and runs blocks that alternate between single views and all views."""
-
-    def __init__(self, inputs: int, blocks: int = 4) -> None:
-        super().__init__()
-        self.embed = nn.Sequential(nn.Linear(inputs, 2 * DIM), nn.GELU(), nn.Linear(2 * DIM, DIM))
-        self.position = nn.Linear(POSITION_CHANNELS, DIM)
-        self.blocks = nn.ModuleList(TokenBlock(DIM, 4, across=i % 2 == 1) for i in range(blocks))
-
-    def forward(self, patches: Tensor, place: Tensor, grid: tuple[int, int], scenes: int = 1) -> tuple[Tensor, ...]:
-        """Maps patches to the taps ``[V, P, DIM]``, in float32.
-
-        Args:
-            patches: ``[V, P, inputs]``.
-            place: their position encodings ``[V, P, POSITION_CHANNELS]``, from :func:`patch_places`.
-            grid: patches per axis.
-            scenes: number of scenes that the views belong to.
-        """
-        taps = attend(self.blocks, self.embed(patches), self.position(place), grid, scenes)
-        return tuple(tap.float() for tap in taps[-TAPS:])
-
-
 def patch_places(
     depth: Tensor,
     world_to_camera: Tensor,
     intrinsics: Tensor,
-    depth_range: Tensor,
+    unit: Tensor,
     size: tuple[int, int],
     scenes: int = 1,
 ) -> Tensor:
@@ -98,7 +76,7 @@ def patch_places(
         depth: depth of the patches ``[V, P]``.
         world_to_camera: ``[V, 4, 4]``.
         intrinsics: ``[V, 3, 3]``, at image resolution.
-        depth_range: near and far, ``[2]`` or ``[V, 2]``; their geometric mean in a scene is the unit of length.
+        unit: unit of length, equal for all views of a scene ``[V]``.
         size: patches per axis.
         scenes: number of scenes that the views belong to.
 
@@ -108,9 +86,7 @@ def patch_places(
     views = len(world_to_camera) // scenes
     pose = world_to_camera[::views].repeat_interleave(views, 0) @ torch.linalg.inv(world_to_camera)
     ray = rays(resize_intrinsics(intrinsics, 1 / PATCH, 1 / PATCH), size)  # [V, 3, P]
-    unit = depth_range.expand(len(depth), 2).log().view(scenes, -1).mean(1).exp()
-    unit = unit.repeat_interleave(views)[:, None, None]
-    point = (pose[:, :3, :3] @ (ray * depth[:, None]) + pose[:, :3, 3:]) / unit
+    point = (pose[:, :3, :3] @ (ray * depth[:, None]) + pose[:, :3, 3:]) / unit[:, None, None]
     direction = F.normalize(pose[:, :3, :3] @ ray, dim=1)
     waves = [wave(point * number) for number in _WAVENUMBERS for wave in (torch.sin, torch.cos)]
     rows, columns = (torch.linspace(0, 1, steps, device=depth.device) for steps in size)

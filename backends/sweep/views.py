@@ -1,8 +1,6 @@
-"""Choice of source views and depth ranges from the cameras."""
+"""Choice of source views from the cameras."""
 
 from __future__ import annotations
-
-import math
 
 import torch
 from torch import Tensor
@@ -14,11 +12,6 @@ _DEPTHS = 5  # planes between near and far for measuring overlap
 # baseline over depth: too little parallax below the first, too different views above the second
 _LEAST_PARALLAX, _MOST_PARALLAX = 0.08, 0.5
 _SEEN_AGAIN = 0.4  # factor on a point's score for every source that already sees it
-_WIDE = (0.1, 40.0)  # range of the first sweep, in units of the largest distance between cameras
-_NEAREST = 0.03  # minimum near of the first sweep, in the same unit
-_OVERLAP = 0.5  # a view of which others see less than this may see something nearer than near
-_NEARER_ALONE = 0.3  # minimum factor on near in such a view
-_TURN = 1.2  # maximum angle between views that count for it, in radians
 
 
 def rays(intrinsics: Tensor, size: tuple[int, int]) -> Tensor:
@@ -112,51 +105,3 @@ def camera_distances(world_to_camera: Tensor) -> Tensor:
     """Returns the distances ``[V, V]`` between the centres of cameras ``[V, 4, 4]``."""
     centers = torch.linalg.inv(world_to_camera)[:, :3, 3]
     return torch.cdist(centers, centers, compute_mode="donot_use_mm_for_euclid_dist")  # mm loses small distances
-
-
-def wide_range(world_to_camera: Tensor) -> Tensor:
-    """Returns near and far ``[2]`` of the first sweep, from the cameras ``[V, 4, 4]`` alone.
-
-    Near is at most the median distance of a camera to its nearest neighbour, but not below a minimum. In long captures
-    the largest distance says little about how near surfaces are, while the steps between views match their distance.
-    """
-    distances = camera_distances(world_to_camera)
-    extent = distances.max()
-    step = distances.fill_diagonal_(torch.inf).min(1).values.median()
-    near = torch.minimum(_WIDE[0] * extent, step.clamp_min(_NEAREST * extent))
-    return torch.stack((near, _WIDE[1] * extent))
-
-
-def agreed_range(depth: Tensor, agreement: Tensor, fallback: Tensor) -> Tensor:
-    """Returns near and far ``[2]`` around the depths whose agreement is above one half.
-
-    Pixels are selected by agreement, not confidence, which is biased towards near, well textured surfaces.
-
-    Args:
-        depth: depth of the pixels, of any shape.
-        agreement: their agreement with the sources in [0, 1], of the same shape.
-        fallback: range ``[2]`` to return if less than 1 % of the pixels agree.
-    """
-    agreed = depth[agreement > 0.5].sort().values
-    if len(agreed) < 0.01 * depth.numel():
-        return fallback
-    low, high = agreed[int(0.01 * len(agreed))], agreed[int(0.99 * len(agreed))]
-    return torch.stack((low * 0.8, high * 1.4))
-
-
-def view_ranges(world_to_camera: Tensor, intrinsics: Tensor, size: tuple[int, int], depth_range: Tensor) -> Tensor:
-    """Returns near and far of every view ``[V, 2]``, with a smaller near where others see little of a view.
-
-    What no other view sees, such as a wall next to the last camera, is often nearer than all that two views see.
-
-    Args:
-        world_to_camera: ``[V, 4, 4]``.
-        intrinsics: ``[V, 3, 3]`` in pixels.
-        size: image ``(height, width)``.
-        depth_range: near and far of the depths on which the views agree ``[2]``.
-    """
-    inside, poses, _ = _seen_by(world_to_camera, intrinsics, size, depth_range)
-    similar = (poses[..., 2, 2] > math.cos(_TURN)).fill_diagonal_(False)
-    overlap = (inside & similar[..., None]).any(1).float().mean(1)
-    near = depth_range[0] * (overlap / _OVERLAP).clamp(_NEARER_ALONE, 1)
-    return torch.stack((near, depth_range[1].expand_as(near)), 1)

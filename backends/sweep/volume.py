@@ -1,4 +1,4 @@
-"""Plane sweep: matches warped features on depth planes, regularises the volume and reads out depth."""
+"""Cost volumes: weighted means of similarities, their regularisation, the depth read from them and its agreement."""
 
 from __future__ import annotations
 
@@ -6,30 +6,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from backends.sweep.correlate import BEHIND, GROUPS, SourceWarp, correlate
+from backends.sweep.correlate import BEHIND, GROUPS, SourceWarp
 from backends.sweep.features import upsample
 
 _VIEWS_AT_A_TIME = 4
 _WINDOW = 2  # planes on either side of the most likely one to average over
-_AGREEMENT_WIDTH = 0.03  # relative depth difference at which agreement falls to 1/e
-
-
-def near_and_far(depth_range: Tensor) -> tuple[Tensor, Tensor]:
-    """Splits a depth range ``[2]`` or ``[V, 2]`` into near and far, each ``[1 or V, 1, 1, 1]``."""
-    near, far = depth_range.view(-1, 2, 1, 1, 1).unbind(1)
-    return near, far
-
-
-def to_inverse(t: Tensor, depth_range: Tensor) -> Tensor:
-    """Converts plane positions ``t [V, ., h, w]`` to inverse depth, linearly: 0 is far, 1 is near."""
-    near, far = near_and_far(depth_range)
-    return 1 / far + t * (1 / near - 1 / far)
-
-
-def from_inverse(inverse: Tensor, depth_range: Tensor) -> Tensor:
-    """Converts inverse depth to plane positions; inverse of :func:`to_inverse`."""
-    near, far = near_and_far(depth_range)
-    return (inverse - 1 / far) / (1 / near - 1 / far)
 
 
 def chunks_of_views(views: int) -> list[slice]:
@@ -55,31 +36,6 @@ def mean_similarity(similarity: Tensor, weight: Tensor, size: tuple[int, int]) -
     return volume.reshape(-1, *size, GROUPS + 1).permute(0, 3, 1, 2)
 
 
-class PlaneSweep(nn.Module):
-    """Group-wise similarity of every view with its sources on depth planes, averaged with learned source weights."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.weigh = nn.Sequential(nn.Conv2d(GROUPS, 16, 1), nn.ReLU(inplace=True), nn.Conv2d(16, 1, 1))
-
-    def forward(self, features: Tensor, inverse: Tensor, warp: SourceWarp) -> Tensor:
-        """Builds the cost volume.
-
-        Args:
-            features: features of all views ``[N, C, h, w]``, of unit length per group.
-            inverse: inverse depths of the planes, ``[V, D, h w]`` or ``[V, D, 1]``.
-            warp: correspondences of all or some of the views.
-
-        Returns:
-            The :func:`mean_similarity`, ``[V D, GROUPS + 1, h, w]``.
-        """
-        size = (features.shape[-2], features.shape[-1])
-        similarity, inside = correlate(features, inverse.expand(-1, -1, size[0] * size[1]), warp)
-        images = similarity.reshape(-1, *size, GROUPS).permute(0, 3, 1, 2)  # [V n D, G, h, w]
-        weight = torch.sigmoid(self.weigh(images).float()).reshape(inside.shape) * inside
-        return mean_similarity(similarity, weight, size)
-
-
 class _PlaneBlock(nn.Module):
     """Residual block on a volume: 3x3 in the image, then 5 along the planes, as 2D convolutions (3D ones are slow)."""
 
@@ -100,7 +56,7 @@ class _PlaneBlock(nn.Module):
 class VolumeNet(nn.Module):
     """Light 2.5D regularisation of a volume to one logit per plane, at full and half resolution."""
 
-    def __init__(self, channels: int = 16) -> None:
+    def __init__(self, channels: int) -> None:
         super().__init__()
         self.begin = nn.Conv2d(GROUPS + 1, channels, 3, 1, 1)
         self.first = _PlaneBlock(channels)
@@ -143,7 +99,7 @@ def expectation(logits: Tensor, positions: Tensor) -> tuple[Tensor, Tensor]:
     return mean, mass
 
 
-def agreement(inverse: Tensor, warp: SourceWarp, width: float = _AGREEMENT_WIDTH) -> Tensor:
+def agreement(inverse: Tensor, warp: SourceWarp, width: float) -> Tensor:
     """Compares each view's depth with the depth of its sources.
 
     Args:

@@ -1,9 +1,16 @@
-"""Trains the plane sweep: ``python -m recipes.sweep [key=value ...]``; options in ``train.yaml``."""
+"""Trains the plane sweep: ``python -m recipes.sweep [key=value ...]``; options in ``train.yaml``.
+
+Training has no planned end: the rate is constant, and the weights to use are a moving average. It continues from
+``OUT/state.safetensors`` if that exists, else from ``begin``. With ``cooldown`` steps the rate falls to zero, all is
+written to ``OUT/cooled``, and a fall that was stopped continues there.
+"""
 
 from __future__ import annotations
 
-import math
+import itertools
 import os
+import signal
+import time
 from pathlib import Path
 from typing import Any
 
@@ -11,146 +18,143 @@ from typing import Any
 os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "20000")
 
 import hydra
-import lightning
 import torch
-from lightning.pytorch.callbacks import ModelCheckpoint, RichProgressBar
-from lightning.pytorch.loggers import CSVLogger
-from lightning.pytorch.strategies import DDPStrategy
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
+from safetensors import safe_open
 from safetensors.torch import load_file, save
 from torch import Tensor
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
-from torch.utils.data import DataLoader, Subset
+from torch.utils.data import DataLoader
 
 from backends.sweep.network import PosedViews, SweepNet
 from recipes.sweep.objective import objective
 from recipes.sweep.samples import Sample, TrainingSamples
-from recipes.sweep.scenes import read_infinigen, scene_files
-from vg2gt.geometry.precision import full_precision
+from recipes.sweep.scenes import scene_files
 from vg2gt.io.files import write_bytes
 
 _LARGEST_GRADIENT = 1.0
+_AVERAGED = "averaged."
+_PLACES = ("out", "begin")  # folders of one machine, which do not belong in its files
+STATE, WEIGHTS = "state.safetensors", "sweep.safetensors"
 
 
-class SweepTraining(lightning.LightningModule):
-    """Trains the network; the shipped weights are an exponential moving average of the trained weights.
-
-    The learning rate is warmed up linearly, stays constant, and decays to 2 % by a half cosine at the end. A checkpoint
-    from before the decay can resume with more ``steps``, as if they had been configured from the start.
+class Training:
+    """The network, the moving average of its weights, the optimizer, and how far training has come.
 
     Args:
         options: ``training`` in ``train.yaml``.
+        state: file to continue from; None for random weights.
+        device: device of the network.
     """
 
-    def __init__(self, options: DictConfig) -> None:
-        super().__init__()
-        self.options = options
-        self.net = SweepNet()
-        self.net.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
-        self.averaged = AveragedModel(self.net, multi_avg_fn=get_ema_multi_avg_fn(options.average))
-        self.averaged.requires_grad_(False)
-
-    def training_step(self, sample: Sample, index: int) -> Tensor:
-        """Returns the objective of one sample; raises RuntimeError if it is not finite."""
-        images = sample.images.contiguous(memory_format=torch.channels_last)
-        views = PosedViews(images, sample.world_to_camera, sample.intrinsics, sample.scenes)
-        encoding = self.net.encode(self.net.features(images), views, sample.depth_range, sample.sources, sample.planes)
-        taps = encoding.taps
-        if self.options.token_noise and self.global_step % 2:
-            taps = tuple(tap + self.options.token_noise * torch.randn_like(tap) for tap in taps)
-        depth, log_scale = self.net.head(taps, encoding.context, encoding.context_fine, encoding.swept)
-        with full_precision(depth):
-            loss, terms = objective(encoding, depth, log_scale, sample)
-        if not torch.isfinite(loss):
-            raise RuntimeError(f"the objective is {float(loss)} at step {self.global_step}: {terms}")
-        self.log_dict({f"train/{name}": term.detach() for name, term in terms.items()} | {"train/loss": loss.detach()})
-        return loss
-
-    def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
-        """Clips the gradient norm, as Lightning cannot with a fused optimizer; raises RuntimeError if not finite."""
-        norm = torch.nn.utils.clip_grad_norm_(self.net.parameters(), _LARGEST_GRADIENT, error_if_nonfinite=True)
-        self.log("train/gradient_norm", norm)
-
-    def on_train_batch_end(self, *_: Any) -> None:
-        """Updates the exponential moving average."""
-        self.averaged.update_parameters(self.net)
-
-    def configure_optimizers(self) -> Any:
-        """Returns AdamW and the learning-rate schedule of the class docstring."""
+    def __init__(self, options: DictConfig, state: Path | None = None, device: str = "cpu") -> None:
+        self.options, self.step, self.seconds, self.here = options, 0, 0.0, 0
+        self.fallen = 0  # steps of a falling rate
+        self.device = torch.device(device)
+        self.net: Any = SweepNet().to(self.device, memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+        self.averaged = {name: value.detach().clone().float() for name, value in self.net.state_dict().items()}
+        if state:
+            with safe_open(state, "pt") as file:
+                metadata = file.metadata()
+            self.step, self.seconds = int(metadata.get("step", 0)), float(metadata.get("seconds", 0))
+            self.fallen = int(metadata.get("fallen", 0))
+            tensors = load_file(state, device)
+            own = {name: value for name, value in tensors.items() if not name.startswith(_AVERAGED)}
+            self.net.load_state_dict(own)
+            self.averaged = {name: tensors.get(_AVERAGED + name, own[name]).float() for name in own}
         decayed = [p for p in self.net.parameters() if p.dim() > 1]
         rest = [p for p in self.net.parameters() if p.dim() <= 1]
-        groups = [{"params": decayed, "weight_decay": self.options.weight_decay}, {"params": rest, "weight_decay": 0.0}]
-        optimizer = torch.optim.AdamW(groups, lr=self.options.rate, betas=(0.9, 0.98), fused=True)
-        scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, self._relative_rate)
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+        groups = [{"params": decayed, "weight_decay": options.weight_decay}, {"params": rest, "weight_decay": 0.0}]
+        self.optimizer = torch.optim.AdamW(groups, lr=options.rate, betas=(0.9, 0.98), fused=True)
 
-    def _relative_rate(self, step: int) -> float:
-        steps = self.options.steps
-        begin = (1 - self.options.cooldown) * steps
-        fall = min(max((step - begin) / max(steps - begin, 1), 0.0), 1.0)
-        return min(1.0, (step + 1) / self.options.warmup) * (0.02 + 0.98 * (0.5 + 0.5 * math.cos(math.pi * fall)))
+    def update(self, sample: Sample, factor: float = 1.0) -> dict[str, float]:
+        """One step on one sample, with ``factor`` on the rate; returns the terms of the objective.
 
+        Raises:
+            RuntimeError: if the objective or a gradient is not finite.
+        """
+        start = time.process_time()
+        sample = Sample(*(value.to(self.device) for value in sample))
+        for group in self.optimizer.param_groups:
+            # the optimizer remembers some 50 steps: its state is not kept, but found again while the rate rises
+            group["lr"] = self.options.rate * factor * min(1.0, (self.here + 1) / self.options.warmup)
+        images = sample.images.contiguous(memory_format=torch.channels_last)
+        views = PosedViews(images, sample.world_to_camera, sample.intrinsics)
+        encoding = self.net.encode(self.net.features(images), views, sample.sources, sample.shown)
+        taps: tuple[Tensor, ...] = encoding.taps
+        if self.options.token_noise and self.step % 2:
+            noise = torch.Generator().manual_seed(self.step)
+            drawn = (torch.randn(tap.shape, generator=noise).to(tap) for tap in taps)
+            taps = tuple(tap + self.options.token_noise * change for tap, change in zip(taps, drawn, strict=True))
+        state = (encoding.context, encoding.context_fine, encoding.swept, encoding.origin)
+        depth, log_scale = self.net.head(taps, *state)
+        loss, terms = objective(encoding, depth, log_scale, sample)
+        if not torch.isfinite(loss):
+            raise RuntimeError(f"the objective is {float(loss)} at step {self.step}: {terms}")
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.net.parameters(), _LARGEST_GRADIENT, error_if_nonfinite=True)
+        self.optimizer.step()
+        # shorter at the beginning, so that the first weights are forgotten
+        keep = min(self.options.average, (self.step + 1) / (self.step + 5))
+        for name, value in self.net.state_dict().items():
+            self.averaged[name].lerp_(value.float(), 1 - keep)
+        self.step, self.here = self.step + 1, self.here + 1
+        self.seconds += time.process_time() - start
+        return {"loss": float(loss.detach())} | {name: float(term.detach()) for name, term in terms.items()}
 
-def write_weights(training: SweepTraining, path: Path, config: DictConfig, rooms: int) -> None:
-    """Writes the averaged weights in half precision, with a summary of the training in the header.
-
-    Args:
-        training: the trained module.
-        path: output safetensors file.
-        config: configuration of the training.
-        rooms: number of Infinigen rooms among its scenes.
-    """
-    state = training.averaged.module.state_dict()
-    tensors = {name: value.detach().half().contiguous() for name, value in sorted(state.items())}
-    made_of = {
-        "steps": str(training.global_step),
-        "scenes": f"{config.scenes.count} from seed {config.scenes.first_seed}, {rooms} Infinigen rooms",
-        "seed": str(config.seed),
-        "begun_with": Path(config.begin).name if config.begin else "random weights",
-        "device": torch.cuda.get_device_name() if config.accelerator == "gpu" else "cpu",
-    }
-    print(write_bytes(path, save(tensors, metadata=made_of)))
+    def write(self, out: Path, config: DictConfig) -> None:
+        """Writes the averaged weights, and what training continues from, in half precision."""
+        options = {name: value for name, value in config.items() if name not in _PLACES}
+        made_of = {"step": str(self.step), "seconds": f"{self.seconds:.0f}", "options": OmegaConf.to_yaml(options)}
+        averaged = {name: value.half().contiguous() for name, value in self.averaged.items()}
+        write_bytes(out / WEIGHTS, save(averaged, metadata=made_of))
+        own = {name: value.detach().half().contiguous() for name, value in self.net.state_dict().items()}
+        own |= {_AVERAGED + name: value for name, value in averaged.items()}
+        write_bytes(out / STATE, save(own, metadata=made_of | {"fallen": str(self.fallen)}))
 
 
 @hydra.main(config_path=".", config_name="train", version_base="1.3")
 def main(config: DictConfig) -> None:
-    """Trains or resumes training, and writes the weights."""
+    """Trains for ``minutes``, or until the process is told to stop."""
     torch.set_num_threads(config.threads)
-    lightning.seed_everything(config.seed)
-    out = Path(config.out)
-    newest = max(out.glob("*.ckpt"), key=lambda path: path.stat().st_mtime, default=None)
-    checkpoint = newest if config.resume == "auto" else config.resume
-    training = SweepTraining(config.training)
-    first = torch.load(checkpoint, "cpu", weights_only=True, mmap=True)["global_step"] if checkpoint else 0
-    files = scene_files(**config.scenes)
-    rooms = read_infinigen(config.infinigen.folder, config.scenes.folder) if config.infinigen.folder else []
-    count = config.training.steps * config.processes
-    every = TrainingSamples(files, count, config.seed, rooms, config.infinigen.share, **config.samples)
-    # all of them, from the next one on: Lightning counts those before a checkpoint as read
-    samples = Subset(every, [(first * config.processes + i) % count for i in range(count)])
-    if config.begin and not checkpoint:
-        for net in (training.net, training.averaged.module):
-            net.load_state_dict(load_file(config.begin))
-    if checkpoint:
-        print(f"resuming {checkpoint} at step {first} of {config.training.steps}", flush=True)
-    keep = ModelCheckpoint(
-        out, "step-{step:06d}", every_n_train_steps=config.save_every, save_top_k=-1, auto_insert_metric_name=False
-    )
-    trainer = lightning.Trainer(
-        accelerator=config.accelerator,
-        devices=config.processes,
-        strategy="auto" if config.processes == 1 else DDPStrategy(gradient_as_bucket_view=True),
-        precision=config.precision,
-        max_steps=config.training.steps,
-        callbacks=[keep, RichProgressBar()],
-        logger=CSVLogger(out, name="", version=""),
-        log_every_n_steps=50,
-        enable_model_summary=False,
-    )
-    workers = {"num_workers": config.workers, "pin_memory": config.accelerator == "gpu"}
-    trainer.fit(training, DataLoader(samples, batch_size=None, **workers), ckpt_path=checkpoint, weights_only=True)
-    if trainer.is_global_zero:
-        write_weights(training, out / "sweep.safetensors", config, len(rooms))
+    torch.manual_seed(config.seed)
+    out = Path(config.out) / "cooled" if config.cooldown else Path(config.out)
+    out.mkdir(parents=True, exist_ok=True)
+    states = [out / STATE, Path(config.out) / STATE, *([Path(config.begin)] if config.begin else [])]
+    begun = next((file for file in states if file.is_file()), None)
+    if config.begin and begun is None:
+        raise FileNotFoundError(f"begin={config.begin} does not exist")
+    training = Training(config.training, begun, config.device)
+    training.fallen = training.fallen if begun == out / STATE else 0
+    files = [file for part in config.scenes.parts for file in scene_files(config.scenes.folder, **part)]
+    files = [file for file in files if file.is_file()] if config.scenes.rendered else files
+    rooms = sorted(Path(config.infinigen.folder).glob("room_*.npz")) if config.infinigen.folder else []
+    samples = TrainingSamples(files, config.seed, rooms, config.infinigen.share, **config.samples)
+    print(f"step {training.step}, {len(files)} scenes, {len(rooms)} rooms, begun with {begun}", flush=True)
+    told: list[int] = []
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *given: told.append(given[0]))
+    start = written = time.monotonic()
+    mean: dict[str, float] = {}
+    first = training.step
+    if config.cooldown and training.fallen >= config.cooldown:
+        raise ValueError(f"{out} holds a fall of {training.fallen} steps, which is over: choose another out=")
+    for sample in DataLoader(samples, batch_size=None, sampler=itertools.count(first), num_workers=config.workers):
+        factor = 1.0 - training.fallen / config.cooldown if config.cooldown else 1.0
+        terms = training.update(sample, factor)
+        training.fallen += bool(config.cooldown)
+        mean = {name: mean.get(name, term) + 0.02 * (term - mean.get(name, term)) for name, term in terms.items()}
+        if training.step % 50 == 0:
+            shown = " ".join(f"{name} {value:.4f}" for name, value in mean.items())
+            rate = (time.monotonic() - start) / (training.step - first)
+            print(f"{training.step} {rate:.2f} s/step {training.seconds / 3600:.2f} h {shown}", flush=True)
+        over = bool(config.cooldown) and training.fallen == config.cooldown
+        if told or over or (config.minutes and time.monotonic() - start > 60 * config.minutes):
+            break
+        if time.monotonic() - written > 60 * config.save_minutes:
+            training.write(out, config)
+            written = time.monotonic()
+    training.write(out, config)
 
 
 if __name__ == "__main__":

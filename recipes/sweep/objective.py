@@ -1,4 +1,4 @@
-"""Training objective of the plane sweep: log-depth at every stage, cross-entropy of planes, edges and uncertainty."""
+"""Training objective of the plane sweep: log-depth of every stage, cross-entropy of planes, edges and uncertainty."""
 
 from __future__ import annotations
 
@@ -6,15 +6,24 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from backends.sweep.network import Sweep, SweepEncoding
-from backends.sweep.volume import from_inverse, near_and_far
+from backends.sweep.network import PLANES, ROWS, SweepEncoding
+from backends.sweep.planes import Planes, baselines
+from backends.sweep.stage import Stage
 from recipes.sweep.samples import Sample
 
-_CLAMP = 2.0  # log-depth errors are clamped to this
-_BEYOND = 1.5  # times the farthest plane: for sky and farther surfaces, any depth from here on counts as correct
+_CLAMP, _SLOPE = 2.0, 0.2  # log-depth errors above this count by the slope only
+_BEYOND = 1.5 / (PLANES - 1)  # position from which on any greater depth counts as correct, as for sky
 _ROOM = 1.0  # up to this much log-depth farther, so that depth does not diverge
 _BEYOND_ERROR = 0.7  # minimum relative error that the uncertainty of such pixels is trained on
-WEIGHTS = {"depth": 2.0, "uncertainty": 0.15, "gradient": 1.0, "planes": 0.4, "position": 2.0, "swept": 1.0}
+WEIGHTS = {
+    "depth": 2.0,
+    "uncertainty": 0.15,
+    "gradient": 1.0,
+    "planes": 0.3,
+    "stages": 0.5,
+    "centers": 0.5,
+    "guess": 0.3,
+}
 
 
 def objective(
@@ -26,41 +35,36 @@ def objective(
         encoding: encoding of the sample's images.
         depth: decoded depth ``[V, H, W]``.
         log_scale: log-scale of its relative error ``[V, H, W]``.
-        sample: ground-truth depth (0 is unknown, infinity is sky) and range of the planes.
+        sample: ground-truth depth (0 is unknown, infinity is sky) and weights of the pixels.
 
     Returns:
         The weighted sum, and its unweighted terms.
     """
-    # decoded depth; pixels beyond the planes only need to be far enough
-    beyond_planes = _BEYOND * near_and_far(sample.depth_range)[1]  # [S V, 1, 1, 1]
-    farthest = beyond_planes[..., 0]
-    beyond = sample.depth > farthest
-    seen = (sample.depth > 0).float()
-    valid = seen * ~beyond
-    error = depth.log() - torch.where(valid > 0, sample.depth, farthest).log()
-    outside = (-error).clamp_min(0) + (error - _ROOM).clamp_min(0)
-    absolute = torch.where(beyond, outside, error.abs()).clamp_max(_CLAMP)
-    stated = torch.where(beyond, absolute.clamp_min(_BEYOND_ERROR), absolute)
+    planes = Planes(baselines(sample.world_to_camera))
+    farthest = planes.inverse(torch.full_like(sample.depth[:, None, :1, :1], _BEYOND)).reciprocal()  # [V, 1, 1, 1]
+    known = (sample.depth > 0).float()
+    error, beyond = _log_error(depth.log()[:, None], sample.depth[:, None], farthest)
+    error, beyond = error[:, 0], beyond[:, 0]
+    stated = torch.where(beyond, error.abs().clamp_min(_BEYOND_ERROR), error.abs()).clamp_max(_CLAMP)
+    valid = known * ~beyond
     log_scale = log_scale.clamp(-6, 1)
     terms = {
-        "depth": mean(absolute, seen),
-        "uncertainty": mean(stated * torch.exp(-log_scale) + log_scale, seen),
+        "depth": mean(_limited(error), known * sample.weight),
+        "uncertainty": mean(stated * torch.exp(-log_scale) + log_scale, known),
         "gradient": sum((gradient(error[:, ::k, ::k], valid[:, ::k, ::k]) for k in (1, 2, 4)), torch.zeros(())),
     }
-    # both sweeps, at 1/4 and 1/2 of the image
-    planes, positions = [], []
-    for sweep, cell in ((encoding.first, 4), (encoding.second, 2)):
-        inverse, known = cell_inverse(sample.depth, cell)
-        finite = known * (inverse > 1 / beyond_planes)
-        inverse = inverse.clamp_min(1 / beyond_planes)
-        t = from_inverse(inverse, sample.depth_range)
-        planes.append(_cross_entropy(sweep, t, known))
-        for position in (sweep.t, encoding.refined if cell == 4 else encoding.center):
-            positions.append(mean((position - t).abs().clamp_max(0.3), known))
-        if cell == 2:
-            terms["swept"] = mean((encoding.swept[:, :1] + inverse.log()).abs().clamp_max(_CLAMP), finite)
-    terms["planes"] = torch.stack(planes).sum()
-    terms["position"] = torch.stack(positions).sum()
+    sums: dict[str, list[Tensor]] = {"planes": [], "stages": [], "centers": [], "guess": []}
+    for stage, center, cell, rows in zip(encoding.stages, encoding.centers, (8, 4, 2), ROWS, strict=True):
+        inverse, seen = cell_inverse(sample.depth, cell)
+        weight = seen * F.avg_pool2d(sample.weight[:, None], cell)
+        truth = inverse.clamp_min(1e-9).reciprocal()
+        found = -planes.inverse(stage.t).log()
+        sums["planes"].append(plane_entropy(stage, planes.position(truth.log()), seen, rows))
+        looked = {"stages": found, "centers": center} | ({"guess": encoding.guess} if cell == 8 else {})
+        for name, log_depth in looked.items():
+            off = _limited(_log_error(log_depth, truth, farthest)[0])
+            sums[name].append(mean(off, seen if name == "stages" else weight))
+    terms |= {name: torch.stack(values).sum() for name, values in sums.items()}
     return torch.stack([WEIGHTS[name] * term for name, term in terms.items()]).sum(), terms
 
 
@@ -91,18 +95,40 @@ def gradient(error: Tensor, valid: Tensor) -> Tensor:
     return down.mean() + right.mean()
 
 
-def _cross_entropy(sweep: Sweep, t: Tensor, known: Tensor) -> Tensor:
-    """Cross-entropy of the planes; the target ``t [V, 1, h, w]`` is split linearly between its two nearest planes."""
-    position = sweep.position.expand(len(t), -1, *t.shape[-2:]) if sweep.position.shape[0] == 1 else sweep.position
-    count = position.shape[1]
-    spacing = position[:, 1:2] - position[:, :1]
-    place = (t - position[:, :1]) / spacing
-    if sweep.position.shape[-1] == 1:  # first sweep: surfaces beyond the farthest plane are assigned to it
-        place = place.clamp_min(0)
-    known = known * (place >= 0) * (place <= count - 1)
-    low = place.floor().clamp(0, count - 2)
-    share = (place - low).clamp(0, 1)
-    likely = F.log_softmax(sweep.logits, 1)
-    low = low.long()
-    entropy = -(likely.gather(1, low) * (1 - share) + likely.gather(1, low + 1) * share)
-    return mean(entropy, known)
+def _log_error(log_depth: Tensor, truth: Tensor, farthest: Tensor) -> tuple[Tensor, Tensor]:
+    """Error of log-depth, and whether the truth is beyond the farthest plane, where it only has to be far enough."""
+    beyond = truth > farthest
+    truth = torch.where(beyond | (truth <= 0), farthest, truth)
+    error = log_depth - truth.log()
+    outside = error.clamp_max(0) + (error - _ROOM).clamp_min(0)
+    return torch.where(beyond, outside, error), beyond
+
+
+def _limited(error: Tensor) -> Tensor:
+    """Absolute error, less of what is gross; never flat, as planes reach to infinity."""
+    return error.abs().clamp_max(_CLAMP) + _SLOPE * (error.abs() - _CLAMP).clamp_min(0)
+
+
+def plane_entropy(stage: Stage, t: Tensor, known: Tensor, rows: int = 1) -> Tensor:
+    """Cross-entropy of the planes of a stage; the target is split linearly between its two nearest planes.
+
+    Args:
+        stage: the stage.
+        t: true positions ``[V, 1, h, w]``.
+        known: 1 where they are known, else 0, ``[V, 1, h, w]``.
+        rows: number of rows of evenly spaced planes; the target is in the first row that holds it.
+
+    Returns:
+        The mean over the pixels whose target is in a row; 0 if there are none.
+    """
+    entropy, every = torch.zeros_like(t), torch.zeros_like(t)
+    likely = F.log_softmax(stage.logits, 1)
+    for position, row in zip(stage.position.chunk(rows, 1), likely.chunk(rows, 1), strict=True):
+        count = position.shape[1]
+        place = count - 1 - (position[:, -1:] - t) / (position[:, -1:] - position[:, -2:-1])
+        held = known * (place >= 0) * (place <= count - 1) * (1 - every)
+        low = place.floor().clamp(0, count - 2)
+        share, low = (place - low).clamp(0, 1), low.long()
+        entropy = entropy - held * (row.gather(1, low) * (1 - share) + row.gather(1, low + 1) * share)
+        every = every + held
+    return entropy.sum() / every.sum().clamp_min(1)

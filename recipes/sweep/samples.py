@@ -1,4 +1,4 @@
-"""Training samples: overlapping views of a scene, cropped, zoomed and recoloured, with slightly wrong poses."""
+"""Training samples: 2 to 12 views of a scene, cropped, zoomed and recoloured, with slightly wrong poses."""
 
 from __future__ import annotations
 
@@ -17,106 +17,22 @@ from torch import Tensor
 from torch.nn import functional as F
 from torch.utils.data import Dataset
 
-from backends.sweep.views import choose_sources
-from recipes.sweep.scenes import SceneFrames, is_room, read_scene
+from backends.sweep.planes import COARSE_SOURCES, coarse_sources
+from recipes.sweep.scenes import SceneFrames, read_scene
 from vg2gt.geometry.cameras import crop_intrinsics, project, resize_intrinsics, rigid_motions, unproject
+from vg2gt.metrics.kinds import pixel_kinds
 from vg2gt.types import Cameras
 
 _UPRIGHT_SHARE = 0.3  # of samples rotated by 90 degrees to portrait format
-_CUT_SHARE = 0.25  # of samples whose planes do not cover the whole depth of the scene
-# Range of the depth quantile at which they end; higher indoors, where walls are near.
-_CUT, _CUT_INDOORS = (0.5, 0.98), (0.85, 0.98)
 _LEAST_OVERLAP = 0.15
 _WALK_FRAMES, _WALK_STEP = 14, math.radians(9)  # maximum frames and median rotation between frames of a walk
-_PLANES = (32, 48)  # few sizes, as convolutions on CPUs are compiled for each
-_SOURCES, _SOURCE_SHARES = (2, 3), (0.7, 0.3)
-SOURCE_NOISE = 0.4  # on log-scores, so that training also sees pairs other than the best
+_FEWER_SHARE = 0.4  # of samples whose views have fewer sources than the network would take
+_ORPHAN_SHARE = 0.2  # of samples in which views, or a region of them, are matched with no source
+_ALONE, _BARE = 1.0, 0.5  # added to the weight of pixels that no other view sees, and of those without texture
+_SOURCE_NOISE = 0.4  # on log-scores, so that training also sees pairs other than the best
 _POSE_SHARE, _TURN, _SHIFT = 0.5, 0.0015, 0.002  # share of samples with pose noise; rad; in depths
-LEAST_PIXELS = 5000  # with known depth, of four views of 80x160; samples with fewer are drawn again
+_LEAST_PIXELS = 5000  # with known depth, of four views of 80x160; samples with fewer are drawn again
 _GREY_SHARE = 0.2
-
-
-class Sample(NamedTuple):
-    """V views of one or more scenes, with the configuration of the sweep.
-
-    Attributes:
-        images: ``[V, 3, H, W]`` in [0, 1].
-        depth: ground-truth depth ``[V, H, W]``; 0 is unknown, infinity is sky.
-        world_to_camera: ``[V, 4, 4]``, with realistic noise in some samples.
-        intrinsics: ``[V, 3, 3]`` in pixels.
-        depth_range: near and far of the planes ``[V, 2]``.
-        sources: indices of the source views of each view ``[V, n]``.
-        planes: number of planes.
-        scenes: number of scenes, with the same number of views each.
-    """
-
-    images: Tensor
-    depth: Tensor
-    world_to_camera: Tensor
-    intrinsics: Tensor
-    depth_range: Tensor
-    sources: Tensor
-    planes: int = 0
-    scenes: int = 1
-
-
-class TrainingSamples(Dataset[Sample]):
-    """Random training samples. Sample n depends on ``(seed, n)`` only, so that training can resume.
-
-    Args:
-        files: files of cached scenes.
-        count: number of samples.
-        seed: seed of all random draws.
-        more: files of a second kind of scenes (rooms of Infinigen).
-        share: probability that a scene is drawn from ``more``, if it is not empty.
-        scenes: number of scenes per sample.
-        views: number of views per scene.
-        sizes: image sizes and their probabilities, ``((height, width, share), ...)``.
-        any_views: share of the samples, except walks, whose views are drawn whether they overlap or not.
-    """
-
-    def __init__(
-        self,
-        files: Sequence[Path],
-        count: int,
-        seed: int,
-        more: Sequence[Path] = (),
-        share: float = 0.25,
-        scenes: int = 1,
-        views: int = 4,
-        sizes: Sequence[Sequence[float]] = ((80, 160, 1.0),),
-        any_views: float = 0.0,
-    ) -> None:
-        self.files, self.count, self.seed = list(files), count, seed
-        self.more, self.share = list(more), share if more else 0.0
-        self.scenes, self.views, self.any_views = scenes, views, any_views
-        self.sizes = [(int(height), int(width)) for height, width, _ in sizes]
-        shares = np.array([share for *_, share in sizes])
-        self.shares = shares / shares.sum()
-
-    def __len__(self) -> int:
-        return self.count
-
-    def __getitem__(self, index: int) -> Sample:
-        rng = np.random.default_rng((self.seed, index))
-        # equal for all scenes of a sample, so that they can be concatenated
-        size = self.sizes[rng.choice(len(self.sizes), p=self.shares)]
-        turns = draw_turns(rng)
-        planes, sources = int(rng.choice(_PLANES)), int(rng.choice(_SOURCES, p=_SOURCE_SHARES))
-        parts = [self._scene(size, turns, sources, rng) for _ in range(self.scenes)]
-        parts = [part._replace(sources=part.sources + n * self.views) for n, part in enumerate(parts)]
-        joined = {name: torch.cat([getattr(part, name) for part in parts]) for name in Sample._fields[:6]}
-        return Sample(**joined, planes=planes, scenes=self.scenes)
-
-    def _scene(self, size: tuple[int, int], turns: int, sources: int, rng: Generator) -> Sample:
-        while True:
-            files = self.more if self.share and rng.random() < self.share else self.files
-            path = files[rng.integers(len(files))]
-            views = choose_views(read_scene(path), self.views, self.any_views, rng)
-            views = turn(crop(views, size, rng), turns)
-            valid = views.depth[(views.depth > 0) & views.depth.isfinite()]
-            if len(valid) >= LEAST_PIXELS:
-                return _finish(views, valid, _CUT_INDOORS if is_room(path) else _CUT, sources, rng)
 
 
 class Crop(NamedTuple):
@@ -126,6 +42,97 @@ class Crop(NamedTuple):
     depth: Tensor
     world_to_camera: Tensor
     intrinsics: Tensor  # [V, 3, 3]
+
+
+class Sample(NamedTuple):
+    """V views of one scene.
+
+    Attributes:
+        images: ``[V, 3, H, W]`` in [0, 1].
+        depth: ground-truth depth ``[V, H, W]``; 0 is unknown, infinity is sky.
+        world_to_camera: ``[V, 4, 4]``, with realistic noise in some samples.
+        intrinsics: ``[V, 3, 3]`` in pixels.
+        sources: indices of the source views of each view ``[V, n]``.
+        shown: 0 where a view is matched with no source, else 1, ``[V, 1, H / 8, W / 8]``.
+        weight: weight of the pixels in the objective ``[V, H, W]``.
+    """
+
+    images: Tensor
+    depth: Tensor
+    world_to_camera: Tensor
+    intrinsics: Tensor
+    sources: Tensor
+    shown: Tensor
+    weight: Tensor
+
+
+class TrainingSamples(Dataset[Sample]):
+    """Random training samples. Sample n depends on ``(seed, n)`` and the files only, so that training can resume.
+
+    Args:
+        files: files of cached scenes.
+        seed: seed of all random draws.
+        more: files of a second kind of scenes (rooms of Infinigen).
+        share: probability that a scene is drawn from ``more``, if it is not empty.
+        shapes: views, image size and probability, ``((views, height, width, share), ...)``.
+        any_views: share of the samples, except walks, whose views are drawn whether they overlap or not.
+        plain: whether colours, poses, sources and views stay as they are (validation).
+    """
+
+    def __init__(
+        self,
+        files: Sequence[Path],
+        seed: int,
+        more: Sequence[Path] = (),
+        share: float = 0.25,
+        shapes: Sequence[Sequence[float]] = ((4, 80, 160, 1.0),),
+        any_views: float = 0.0,
+        plain: bool = False,
+    ) -> None:
+        self.files, self.seed, self.plain = list(files), seed, plain
+        self.more, self.share, self.any_views = list(more), share if more else 0.0, any_views
+        self.shapes = [(int(views), (int(height), int(width))) for views, height, width, _ in shapes]
+        shares = np.array([share for *_, share in shapes])
+        self.shares = shares / shares.sum()
+
+    def __getitem__(self, index: int) -> Sample:
+        rng = np.random.default_rng((self.seed, index))
+        count, size = self.shapes[rng.choice(len(self.shapes), p=self.shares)]
+        turns = draw_turns(rng)
+        while True:
+            files = self.more if self.share and rng.random() < self.share else self.files
+            path = files[rng.integers(len(files))]
+            views = choose_views(read_scene(path), count, self.any_views, rng)
+            views = turn(crop(views, size, rng), 0 if self.plain else turns)
+            valid = views.depth[(views.depth > 0) & views.depth.isfinite()]
+            if len(valid) >= _LEAST_PIXELS * views.depth.numel() / 51_200:
+                return self._finish(views, valid, rng)
+
+    def _finish(self, views: Crop, valid: Tensor, rng: Generator) -> Sample:
+        """Draws the unit of length, pose noise, sources, orphans and colours of a sample."""
+        unit = math.exp(rng.normal(0, 0.5))  # random unit, so that the network cannot rely on it
+        poses, depth = views.world_to_camera.clone(), views.depth * unit
+        poses[:, :3, 3] *= unit
+        count, size = len(poses), (depth.shape[-2], depth.shape[-1])
+        cameras = Cameras(poses[None], views.intrinsics[None], size)
+        kinds = pixel_kinds(views.images, torch.where(depth.isfinite(), depth, 0.0), cameras)
+        alone, bare = kinds["alone"].float(), kinds["bare"].float()
+        shown = torch.ones(count, 1, size[0] // 8, size[1] // 8)
+        most, noise = min(COARSE_SOURCES, count - 1), None
+        images = views.images
+        if not self.plain:
+            low, middle = (float(unit * torch.quantile(valid[:: len(valid) // 4000 + 1], q)) for q in (0.01, 0.5))
+            poses = with_noise(poses, min(middle, 3 * low), rng)
+            if most > 1 and rng.random() < _FEWER_SHARE:
+                most = int(rng.integers(1 if rng.random() < 0.3 else 2, most + 1))
+            noise = torch.from_numpy(rng.normal(0, _SOURCE_NOISE, (count, count))).float()
+            if rng.random() < _ORPHAN_SHARE:
+                shown = _orphan(shown, rng)
+            images = recolour(images, rng)
+        sources = coarse_sources(poses, views.intrinsics, size, most, noise)
+        hidden = 1 - shown[:, 0].repeat_interleave(8, 1).repeat_interleave(8, 2)
+        weight = 1 + _ALONE * torch.maximum(alone, hidden) + _BARE * bare * (1 - hidden)
+        return Sample(images, depth, poses, views.intrinsics, sources, shown, weight)
 
 
 def choose_views(scene: SceneFrames, count: int, any_views: float, rng: Generator) -> Crop:
@@ -214,26 +221,19 @@ def turn(views: Crop, turns: int) -> Crop:
     return Crop(images.contiguous(), depth.contiguous(), poses, intrinsics)
 
 
-def _finish(views: Crop, valid: Tensor, cut: tuple[float, float], sources: int, rng: Generator) -> Sample:
-    """Draws the unit of length, the range of the planes, pose noise, sources and colours of a sample.
-
-    The range contains the true one, except in some samples whose planes end at a depth quantile within ``cut``.
-    """
-    unit = math.exp(rng.normal(0, 0.5))  # random unit, so that the network cannot rely on it
-    poses, depth = views.world_to_camera.clone(), views.depth * unit
-    poses[:, :3, 3] *= unit
-    some = valid[:: max(len(valid) // 4000, 1)]
-    low, middle, high = (float(unit * torch.quantile(some, q)) for q in (0.01, 0.5, 0.99))
-    if rng.random() < _CUT_SHARE:  # as when structure from motion finds no points in the background
-        high = float(unit * torch.quantile(some, rng.uniform(*cut)))
-    near = low * math.exp(-(rng.uniform(0.02, 0.5) if rng.random() < 0.75 else rng.uniform(0, 1.8)))
-    far = high * math.exp(rng.uniform(0, 0.6) if rng.random() < 0.75 else rng.uniform(0, 2.5))
-    poses = with_noise(poses, min(middle, 3 * low), rng)
-    depth_range, size = torch.tensor([near, far]), (depth.shape[-2], depth.shape[-1])
-    noise = torch.from_numpy(rng.normal(0, SOURCE_NOISE, (len(poses), len(poses)))).float()
-    chosen = choose_sources(poses, views.intrinsics, size, depth_range, sources, noise)
-    look = recolour(views.images, rng)
-    return Sample(look, depth, poses, views.intrinsics, depth_range.expand(len(poses), 2), chosen)
+def _orphan(shown: Tensor, rng: Generator) -> Tensor:
+    """Hides the sources of one or two views, or of a region of each view."""
+    views, _, height, width = shown.shape
+    shown = shown.clone()
+    if rng.random() < 0.5:
+        shown[rng.permutation(views)[: 1 + int(views > 3 and rng.random() < 0.4)]] = 0
+        return shown
+    for view in range(views):
+        if rng.random() < 0.6:
+            rows, columns = (max(1, int(n * rng.uniform(0.25, 0.8))) for n in (height, width))
+            top, left = int(rng.integers(0, height - rows + 1)), int(rng.integers(0, width - columns + 1))
+            shown[view, :, top : top + rows, left : left + columns] = 0
+    return shown
 
 
 def with_noise(poses: Tensor, unit: float, rng: Generator) -> Tensor:

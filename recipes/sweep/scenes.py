@@ -1,8 +1,7 @@
-"""Training scenes: procedural ones with varied cameras (focal length, roll, shake), and rooms of Infinigen; cached."""
+"""Training scenes, cached: procedural ones with varied cameras (focal length, roll, shake), slim rooms of Infinigen."""
 
 from __future__ import annotations
 
-import hashlib
 import io
 import os
 from functools import partial
@@ -17,7 +16,6 @@ from torch import Tensor
 from examples.worlds import Worlds
 from examples.worlds.photograph import Photograph
 from recipes.infinigen.slim import read_slim
-from vg2gt.data.sources.infinigen import Infinigen
 from vg2gt.data.synthetic.synthetic_scene import LOBES, SyntheticScene
 from vg2gt.geometry.cameras import rigid_motions
 from vg2gt.io.arrays import read_npz
@@ -58,12 +56,6 @@ def scene_files(folder: str | os.PathLike[str], count: int, first_seed: int, siz
     """
     root = Path(folder).expanduser()
     return [root / f"{seed:08d}-{size[0]}x{size[1]}.npz" for seed in range(first_seed, first_seed + count)]
-
-
-def is_room(path: Path) -> bool:
-    """Returns whether a scene is a room."""
-    first = path.stem.split("-")[0]
-    return first == "infinigen" or first.startswith("room_") or _KINDS[int(first) % len(_KINDS)] in ("room", "wide")
 
 
 def read_scene(path: Path) -> SceneFrames:
@@ -121,26 +113,6 @@ def _shake(scene: SyntheticScene, rng: np.random.Generator, metres: float) -> ND
     shifts = rng.normal(0, metres, (count, 3))
     motion = rigid_motions(torch.from_numpy(turns), torch.from_numpy(shifts)).numpy()
     return np.asarray(motion @ scene.world_to_camera, np.float64)
-
-
-def read_infinigen(folder: str | os.PathLike[str], cache: str | os.PathLike[str]) -> list[Path]:
-    """Converts all rooms in ``folder`` to files in ``cache`` that load quickly; returns these files.
-
-    Views through windows count as sky.
-    """
-    root, paths = Path(cache).expanduser(), []
-    source = Infinigen(str(folder))
-    for scene in source.scenes:
-        frames = source.scene_index(scene).folder.resolve()
-        state = hashlib.sha256(f"{frames} {frames.stat().st_mtime_ns}".encode()).hexdigest()[:8]
-        path = root / f"infinigen-{scene.replace('/', '-')}-{state}.npz"
-        if not path.is_file():
-            read = source.load(scene, source.frames(scene))
-            pixels = (read.images.permute(0, 2, 3, 1) * 255).round().byte()
-            cameras = (read.world_to_camera.numpy(), read.intrinsics.numpy())
-            _write(path, _arrays(pixels.numpy(), read.depth.numpy(), *cameras))
-        paths.append(path)
-    return paths
 
 
 def _arrays(

@@ -1,18 +1,13 @@
-"""The plane sweep: its geometry, its kernels against their reference, its limits."""
+"""The plane sweep: its geometry, its kernels against their reference, its shipped weights."""
 
-import math
-
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from backends.sweep.backend import SweepBackend
 from backends.sweep.correlate import GROUPS, SourceWarp, correlate, correlate_reference
-from backends.sweep.network import PosedViews
-from backends.sweep.views import agreed_range, choose_sources, view_ranges, wide_range
+from backends.sweep.views import choose_sources
 from backends.sweep.volume import agreement
-from examples.worlds import Worlds
 from vg2gt.data import SyntheticScenes
 from vg2gt.types import Batch, Cameras, Hints
 
@@ -61,10 +56,12 @@ def test_agreement_is_one_for_true_depth_and_signed_otherwise(make_scene) -> Non
     warp = SourceWarp(hints.cameras.world_to_camera[0], hints.cameras.intrinsics[0], sources, SIZE)
     inverse = 1 / hints.depth[0][:, None]
     inner = (..., slice(3, -3), slice(5, -5))
-    assert (agreement(inverse, warp)[:, 1][inner] > 0.99).float().mean() > 0.7  # the rest is outside of the sources
+    assert (
+        agreement(inverse, warp, 0.03)[:, 1][inner] > 0.99
+    ).float().mean() > 0.7  # the rest is outside
     nearer = inverse.clone()
     nearer[0] *= 1.1  # view 0 believes everything to be nearer than the others do
-    difference = agreement(nearer, warp)[:, 2][inner]
+    difference = agreement(nearer, warp, 0.03)[:, 2][inner]
     assert (difference[0] <= 0).all()
     assert (difference[1:] >= 0).float().mean() > 0.9
     assert difference[0].mean() < -0.05
@@ -95,53 +92,6 @@ def test_sources_together_cover_the_view() -> None:
     assert choose_sources(poses, intrinsics, size, depth_range, 3)[0].tolist() == [1, 3, 2]
 
 
-def test_ranges() -> None:
-    poses, _ = row_of_cameras(4)
-    walk, _ = row_of_cameras(21)  # 4 long: something may stand as near as a step
-    ranges = torch.stack((wide_range(poses), wide_range(walk)))
-    torch.testing.assert_close(ranges, torch.tensor([[0.06, 24.0], [0.2, 160.0]]), rtol=1e-4, atol=0)
-    close, _ = row_of_cameras(4, step=1e-4)
-    close[0, 0, 3] = 1.0  # and one camera far away
-    torch.testing.assert_close(wide_range(close), torch.tensor([0.03, 40.0]), rtol=1e-3, atol=0)
-    depth = torch.cat((torch.linspace(2, 4, 1000), torch.full((1000,), 90.0)))
-    agreeing = torch.cat((torch.ones(1000), torch.zeros(1000)))
-    found = agreed_range(depth, agreeing, wide_range(poses))
-    torch.testing.assert_close(found, torch.tensor([2.02 * 0.8, 3.98 * 1.4]), rtol=1e-2, atol=0)
-    assert torch.equal(agreed_range(depth, 0 * agreeing, wide_range(poses)), wide_range(poses))
-
-
-def test_views_that_overlap_little_search_nearer() -> None:
-    """The last of four cameras looks where the others do, then to the side, then away from them."""
-    poses, intrinsics = row_of_cameras(4)
-
-    def near_of_the_last(turn: float) -> float:
-        turned = poses.clone()
-        cosine, sine = math.cos(turn), math.sin(turn)
-        turned[3, :3] = torch.tensor([[cosine, 0, -sine], [0, 1, 0], [sine, 0, cosine]]) @ poses[3, :3]
-        ranges = view_ranges(turned, intrinsics, (14, 22), torch.tensor([2.0, 9.0]))
-        torch.testing.assert_close(ranges[:3], torch.tensor([[2.0, 9.0]]).repeat(3, 1))
-        assert ranges[3, 1] == 9
-        return float(ranges[3, 0])
-
-    assert near_of_the_last(0.0) == 2
-    assert 0.6 < near_of_the_last(0.7) < 2
-    assert near_of_the_last(math.pi) == pytest.approx(0.6)
-
-
-def test_depth_is_in_the_unit_of_the_cameras_and_those_in_one_place_are_refused(make_scene) -> None:
-    """Metres or millimetres: the same network, the same depth in its unit."""
-    backend = SweepBackend(pretrained=False)
-    images, hints = make_scene(1, 3, (32, 48))
-    given = Hints(cameras=hints.cameras)
-    depth = backend.decode(backend.encode(images, given)).depth
-    given.cameras.world_to_camera[..., :3, 3] *= 1000
-    large = backend.decode(backend.encode(images, given)).depth
-    torch.testing.assert_close(large / 1000, depth, rtol=2e-2, atol=0)
-    given.cameras.world_to_camera[..., :3, 3] = 0
-    with pytest.raises(ValueError, match=r"parallax, but .* all cameras are at the same position"):
-        backend.encode(images, given)
-
-
 @pytest.fixture(scope="module")
 def unseen_room() -> Batch:
     """Eight views of a room that neither the backbone nor anything else was trained on."""
@@ -159,48 +109,3 @@ def test_shipped_weights_measure_depth(unseen_room: Batch) -> None:
     assert error.median() < 0.05
     order = geometry.depth_conf.flatten().argsort(descending=True)
     assert error[order[: len(order) // 2]].mean() < 0.6 * error.mean()
-
-
-@torch.no_grad()
-def test_the_range_comes_from_the_cameras_and_a_given_one_is_searched_beyond(unseen_room: Batch) -> None:
-    """Neither is anything cut off, nor do planes stand where nothing is; also where one camera is far from the rest."""
-    network = SweepBackend().network
-    cameras, images = unseen_room.cameras, unseen_room.images[0]
-    features = network.features(images)
-    low, high = (float(unseen_room.depth.quantile(q)) for q in (0.02, 0.98))
-    alone = cameras.world_to_camera[0].clone()
-    alone[-1, :3, 3] += alone[-1, :3, :3] @ torch.tensor([0.0, 8.0, 0.0])  # above the room, and turned away:
-    alone[-1] = torch.diag(torch.tensor([-1.0, 1, -1, 1])) @ alone[-1]  # it sees nothing that others see
-    for poses in (alone, cameras.world_to_camera[0]):
-        views = PosedViews(images, poses, cameras.intrinsics[0])
-        ranges = network.find_range(features, views, 3)
-        assert torch.equal(ranges[:, 1], ranges[:1, 1].expand(8))
-        (near, far), shortened = ranges[0].tolist(), ranges[:, 0] < 0.99 * ranges[:, 0].max()
-        assert shortened.tolist() == [False] * 7 + [poses is alone]  # what it sees may be nearer
-        assert 0.4 * low < near < 1.1 * low
-        assert 0.9 * high < far < 2.5 * high
-    # Sparse points miss what is near in few views; told too little, the sweep finds the rest.
-    low, middle, high = (float(unseen_room.depth.quantile(q)) for q in (0.05, 0.5, 0.95))
-    near, far = network.find_range(features, views, 3, torch.tensor([0.9 * middle, 1.1 * middle]))[0].tolist()
-    wide = network.find_range(features, views, 3, torch.tensor([0.5 * low, 2 * high]))[0].tolist()
-    assert 0.45 * middle * 0.8 <= near < max(low, 0.6 * middle)
-    assert min(high, 1.4 * middle) < far < 3.3 * middle * 1.4
-    assert wide[0] <= 0.5 * low
-    assert wide[1] >= 2 * high
-
-
-@torch.no_grad()
-def test_a_given_range_is_not_prolonged_by_the_sky() -> None:
-    """Sky agrees at any large depth, which once made the far end that a hint gives four times as far."""
-    rows = [0, 2, 4, 6]
-    scene = Worlds.variants["outdoor"](4, 14, (64, 128), False)
-    frames = scene.render(rows, 1, samples=1)
-    images = torch.stack([torch.from_numpy(np.asarray(frame.image)) for frame in frames]).permute(0, 3, 1, 2) / 255
-    depth = torch.stack([torch.from_numpy(np.asarray(frame.depth)) for frame in frames])
-    assert (depth == 0).float().mean() > 0.03  # sky
-    near, far = 0.8 * depth[depth > 0].quantile(0.01), 1.4 * depth[depth > 0].quantile(0.99)
-    poses = torch.from_numpy(scene.world_to_camera[rows]).float()
-    views = PosedViews(images, poses, torch.from_numpy(scene.intrinsics).float().repeat(4, 1, 1))
-    network = SweepBackend().network
-    found = network.find_range(network.features(images), views, 3, torch.stack((near, far)).float())
-    assert (found[:, 1] / far).tolist() == pytest.approx([1.0] * 4, rel=0.1)

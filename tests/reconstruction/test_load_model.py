@@ -40,7 +40,7 @@ def test_options_change_parts(run_folder: Path) -> None:
     ("overrides", "said"),
     [
         (["backend=oracle", "backend.noise=1"], r"Could not override 'backend\.noise'"),
-        (["backend.noise=1"], r"option 'backend\.noise=1': .*not in struct; backend has .*planes"),
+        (["backend.noise=1"], r"option 'backend\.noise=1': .*not in struct; backend has .*path"),
         (["backend=oracle", "backend.taps"], "expected key=value"),
         (["backend=oracle", "backend.depth_noise=-1"], "noise must not be negative"),
     ],
@@ -72,7 +72,7 @@ def test_what_ships_needs_no_name() -> None:
     loaded = load_model(device="cpu")
     assert (loaded.model.backend.name, loaded.weights.path) == ("sweep", SHIPPED)
     assert load_model(backend="sweep", device="cpu").weights.path == SHIPPED
-    assert load_model(None, "sweep", ["backend.planes=32"], device="cpu").weights.path is None
+    assert load_model(None, "sweep", ["+backend.seed=1"], device="cpu").weights.path is None
 
 
 def test_views_check_the_depth_of_learned_backbones() -> None:

@@ -157,7 +157,7 @@ def depth_range(pictures: Sequence[Picture]) -> Tensor | None:
     """Returns near and far ``[1, 2]`` of the pictures' sparse points; None if there are too few.
 
     The range leaves out 1 % of the observed points at either end and is then widened: points lie on texture, so floors
-    in front of the camera and bare walls behind have none. The plane sweep also searches beyond this range.
+    in front of the camera and bare walls behind have none.
     """
     known = [picture.point_depths for picture in pictures if picture.point_depths is not None]
     depths = np.concatenate(known) if known else np.zeros(0)

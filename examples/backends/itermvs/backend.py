@@ -10,8 +10,9 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from backends.base import Backend
-from backends.sweep.views import agreed_range, choose_sources, wide_range
+from backends.sweep.views import choose_sources
 from backends.weights import Weights
+from examples.backends.itermvs.depth_range import agreed_range, wide_range
 from examples.backends.itermvs.matching import Projections
 from examples.backends.itermvs.network import HIDDEN, STRIDE, IterMVSNet
 from vg2gt.geometry.cameras import resize_intrinsics

@@ -1,15 +1,32 @@
-"""One stage of the cascade: matches features on planes with weights for every source and pixel."""
+"""One stage: matches features on planes with weights for every source and pixel."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from backends.cascade.fused import fused_volume
-from backends.cascade.planes import Planes
 from backends.sweep.correlate import GROUPS, SourceWarp, correlate
-from backends.sweep.network import Sweep
+from backends.sweep.fused import fused_volume
+from backends.sweep.planes import Planes
 from backends.sweep.volume import VolumeNet, chunks_of_views, expectation, mean_similarity
+
+
+class Stage(NamedTuple):
+    """Result of one stage.
+
+    Attributes:
+        logits: logits of the planes ``[V, D, h, w]``.
+        position: positions of the planes, ``[V, D, h, w]`` or broadcastable; 0 is far, 1 is near.
+        t: expected position ``[V, 1, h, w]``.
+        mass: probability mass around it ``[V, 1, h, w]``.
+    """
+
+    logits: Tensor
+    position: Tensor
+    t: Tensor
+    mass: Tensor
 
 
 class Matching(nn.Module):
@@ -40,7 +57,7 @@ class Matching(nn.Module):
         warp: SourceWarp,
         visible: Tensor | None = None,
         shown: Tensor | None = None,
-    ) -> tuple[Sweep, Tensor]:
+    ) -> tuple[Stage, Tensor]:
         """Matches all views; without gradients, a few at a time to save memory.
 
         Args:
@@ -64,7 +81,7 @@ class Matching(nn.Module):
             seen.append(weight)
         every = torch.cat(logits)
         t, mass = expectation(every, position)
-        return Sweep(every, position, t, mass), torch.cat(seen)
+        return Stage(every, position, t, mass), torch.cat(seen)
 
     def _volume(
         self, maps: Tensor, inverse: Tensor, warp: SourceWarp, visible: Tensor | None, shown: Tensor | None

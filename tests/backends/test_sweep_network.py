@@ -1,4 +1,4 @@
-"""The cascade plane sweep: its planes, its fused kernel against torch, the contract of its tokens."""
+"""The plane sweep: its planes, its fused kernel against torch, the contract of its tokens."""
 
 from dataclasses import replace
 
@@ -7,13 +7,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from backends.cascade import CascadeBackend
-from backends.cascade.network import PLANES, CascadeEncoding, CascadeNet
-from backends.cascade.planes import FARTHEST, Planes, baselines, coarse_sources, fine_sources
-from backends.cascade.sweep import Matching
+from backends.sweep import SweepBackend
 from backends.sweep.correlate import SourceWarp
-from backends.sweep.network import PosedViews
+from backends.sweep.network import PLANES, PosedViews, SweepEncoding, SweepNet
+from backends.sweep.planes import FARTHEST, Planes, baselines, coarse_sources, fine_sources
 from backends.sweep.refine import RESPONSE
+from backends.sweep.stage import Matching
 from vg2gt.geometry.cameras import resize_intrinsics
 from vg2gt.types import Hints
 
@@ -21,10 +20,10 @@ SIZE = (32, 48)
 
 
 @pytest.fixture
-def network() -> CascadeNet:
+def network() -> SweepNet:
     """Random weights, also where training begins with zeros."""
     torch.manual_seed(0)
-    net = CascadeNet()
+    net = SweepNet()
     with torch.no_grad():
         for parameter in net.parameters():
             if not parameter.any():
@@ -37,7 +36,7 @@ def posed(make_scene, views: int = 4, scene: int = 0) -> PosedViews:
     return PosedViews(images[scene], hints.cameras.world_to_camera[scene], hints.cameras.intrinsics[scene])
 
 
-def encode(net: CascadeNet, views: PosedViews, shown: Tensor | None = None, count: int = 6) -> CascadeEncoding:
+def encode(net: SweepNet, views: PosedViews, shown: Tensor | None = None, count: int = 6) -> SweepEncoding:
     sources = coarse_sources(views.world_to_camera, views.intrinsics, views.size, count)
     return net.encode(net.features(views.images), views, sources, shown)
 
@@ -74,7 +73,7 @@ def test_sources_that_see_something_else_are_taken() -> None:
 
 
 @pytest.mark.parametrize("estimated", [True, False])
-def test_fused_volume_is_that_of_torch(make_scene, network: CascadeNet, estimated: bool) -> None:
+def test_fused_volume_is_that_of_torch(make_scene, network: SweepNet, estimated: bool) -> None:
     views = posed(make_scene)
     matching: Matching = network.matching[0]  # type: ignore[assignment]
     torch.nn.init.normal_(matching.visible.weight, std=5)
@@ -93,7 +92,7 @@ def test_fused_volume_is_that_of_torch(make_scene, network: CascadeNet, estimate
     assert float(seen.std()) > 0.01
 
 
-def test_shapes_and_gradients(make_scene, network: CascadeNet) -> None:
+def test_shapes_and_gradients(make_scene, network: SweepNet) -> None:
     """Every parameter gets a finite gradient, also with two views."""
     views = posed(make_scene, 2)
     encoding = encode(network, views)
@@ -111,7 +110,7 @@ def test_shapes_and_gradients(make_scene, network: CascadeNet) -> None:
 
 
 @torch.no_grad()
-def test_scenes_are_encoded_as_if_alone(make_scene, network: CascadeNet) -> None:
+def test_scenes_are_encoded_as_if_alone(make_scene, network: SweepNet) -> None:
     alone = [posed(make_scene, 3, scene) for scene in (0, 1)]
     fields = [torch.cat([getattr(views, name) for views in alone]) for name in alone[0]._fields[:3]]
     sources = [coarse_sources(views.world_to_camera, views.intrinsics, SIZE) for views in alone]
@@ -122,7 +121,7 @@ def test_scenes_are_encoded_as_if_alone(make_scene, network: CascadeNet) -> None
     torch.testing.assert_close(found.taps[-1], torch.cat([each.taps[-1] for each in expected]), rtol=1e-3, atol=1e-3)
 
 
-def test_an_orphaned_view_is_matched_with_nothing(make_scene, network: CascadeNet) -> None:
+def test_an_orphaned_view_is_matched_with_nothing(make_scene, network: SweepNet) -> None:
     """Its logits do not depend on what the others show there; those of the other views do."""
     views = posed(make_scene)
     shown = torch.ones(4, 1, SIZE[0] // 8, SIZE[1] // 8)
@@ -136,7 +135,7 @@ def test_an_orphaned_view_is_matched_with_nothing(make_scene, network: CascadeNe
 
 def test_a_change_of_the_tokens_changes_depth_smoothly(make_scene) -> None:
     """The first channels of the last tap are log-depth: no change decodes the same, a small one changes it alike."""
-    backend = CascadeBackend(pretrained=False)
+    backend = SweepBackend(pretrained=False)
     images, hints = make_scene(2, 3, SIZE)
     tokens = backend.encode(images, Hints(cameras=hints.cameras))
     assert [tuple(tap.shape) for tap in tokens.patch] == [(2, 3, 24, 128)] * 2
@@ -154,7 +153,7 @@ def test_a_change_of_the_tokens_changes_depth_smoothly(make_scene) -> None:
 
 def test_depth_is_in_the_unit_of_the_cameras_and_needs_no_range(make_scene) -> None:
     """Metres or millimetres give the same depth in their unit, and a range in the hints changes nothing."""
-    backend = CascadeBackend(pretrained=False)
+    backend = SweepBackend(pretrained=False)
     images, hints = make_scene(1, 3, SIZE)
     given = Hints(cameras=hints.cameras)
     depth = backend.decode(backend.encode(images, given)).depth
@@ -169,7 +168,7 @@ def test_depth_is_in_the_unit_of_the_cameras_and_needs_no_range(make_scene) -> N
         backend.encode(images, given)
 
 
-def test_nothing_is_much_farther_than_what_matches(make_scene, network: CascadeNet) -> None:
+def test_nothing_is_much_farther_than_what_matches(make_scene, network: SweepNet) -> None:
     """In training nothing is limited: sky must be able to become infinitely far."""
     views = posed(make_scene)
     with torch.no_grad():
@@ -181,12 +180,7 @@ def test_nothing_is_much_farther_than_what_matches(make_scene, network: CascadeN
     assert encode(network, views).centers[0].max() > 10
 
 
-def test_weights_must_be_named() -> None:
-    with pytest.raises(FileNotFoundError, match=r"no published weights: give backend\.path=FILE"):
-        CascadeBackend()
-
-
-def test_a_second_answer_is_searched_at_a_quarter(make_scene, network: CascadeNet) -> None:
+def test_a_second_answer_is_searched_at_a_quarter(make_scene, network: SweepNet) -> None:
     """The second row of planes lies around the likeliest plane of the first stage that the first row leaves out."""
     with torch.no_grad():
         encoding = encode(network, posed(make_scene, 3))

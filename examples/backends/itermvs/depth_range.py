@@ -1,0 +1,41 @@
+"""Depth ranges: from the cameras alone, and from the depths that a first search finds."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from backends.sweep.views import camera_distances
+
+_WIDE = (0.1, 40.0)  # range of the first search, in units of the largest distance between cameras
+_NEAREST = 0.03  # minimum near of the first search, in the same unit
+
+
+def wide_range(world_to_camera: Tensor) -> Tensor:
+    """Returns near and far ``[2]`` of a first search, from the cameras ``[V, 4, 4]`` alone.
+
+    Near is at most the median distance of a camera to its nearest neighbour, but not below a minimum. In long captures
+    the largest distance says little about how near surfaces are, while the steps between views match their distance.
+    """
+    distances = camera_distances(world_to_camera)
+    extent = distances.max()
+    step = distances.fill_diagonal_(torch.inf).min(1).values.median()
+    near = torch.minimum(_WIDE[0] * extent, step.clamp_min(_NEAREST * extent))
+    return torch.stack((near, _WIDE[1] * extent))
+
+
+def agreed_range(depth: Tensor, agreement: Tensor, fallback: Tensor) -> Tensor:
+    """Returns near and far ``[2]`` around the depths whose agreement is above one half.
+
+    Pixels are selected by agreement, not confidence, which is biased towards near, well textured surfaces.
+
+    Args:
+        depth: depth of the pixels, of any shape.
+        agreement: their agreement with the sources in [0, 1], of the same shape.
+        fallback: range ``[2]`` to return if less than 1 % of the pixels agree.
+    """
+    agreed = depth[agreement > 0.5].sort().values
+    if len(agreed) < 0.01 * depth.numel():
+        return fallback
+    low, high = agreed[int(0.01 * len(agreed))], agreed[int(0.99 * len(agreed))]
+    return torch.stack((low * 0.8, high * 1.4))

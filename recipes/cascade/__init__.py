@@ -1,1 +1,0 @@
-"""Recipe for the weights of the cascade plane sweep: samples, objective and training."""
