@@ -125,9 +125,13 @@ def main(config: DictConfig) -> None:
     if config.begin and begun is None:
         raise FileNotFoundError(f"begin={config.begin} does not exist")
     training = Training(config.training, begun, config.device)
-    training.fallen = training.fallen if begun == out / STATE else 0
+    training.fallen = training.fallen if begun == out / STATE else 0  # another fall may have made what this begins with
+    if config.cooldown and training.fallen >= config.cooldown:
+        raise ValueError(f"{out} holds a fall of {training.fallen} steps, which is over: choose another out=")
     files = [file for part in config.scenes.parts for file in scene_files(config.scenes.folder, **part)]
     files = [file for file in files if file.is_file()] if config.scenes.rendered else files
+    if not files:
+        raise FileNotFoundError(f"{config.scenes.folder} has no rendered scene: set scenes.rendered=false")
     rooms = sorted(Path(config.infinigen.folder).glob("room_*.npz")) if config.infinigen.folder else []
     samples = TrainingSamples(files, config.seed, rooms, config.infinigen.share, **config.samples)
     print(f"step {training.step}, {len(files)} scenes, {len(rooms)} rooms, begun with {begun}", flush=True)
@@ -137,8 +141,6 @@ def main(config: DictConfig) -> None:
     start = written = time.monotonic()
     mean: dict[str, float] = {}
     first = training.step
-    if config.cooldown and training.fallen >= config.cooldown:
-        raise ValueError(f"{out} holds a fall of {training.fallen} steps, which is over: choose another out=")
     for sample in DataLoader(samples, batch_size=None, sampler=itertools.count(first), num_workers=config.workers):
         factor = 1.0 - training.fallen / config.cooldown if config.cooldown else 1.0
         terms = training.update(sample, factor)

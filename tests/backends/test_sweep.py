@@ -56,9 +56,7 @@ def test_agreement_is_one_for_true_depth_and_signed_otherwise(make_scene) -> Non
     warp = SourceWarp(hints.cameras.world_to_camera[0], hints.cameras.intrinsics[0], sources, SIZE)
     inverse = 1 / hints.depth[0][:, None]
     inner = (..., slice(3, -3), slice(5, -5))
-    assert (
-        agreement(inverse, warp, 0.03)[:, 1][inner] > 0.99
-    ).float().mean() > 0.7  # the rest is outside
+    assert (agreement(inverse, warp, 0.03)[:, 1][inner] > 0.99).float().mean() > 0.7  # the rest is outside
     nearer = inverse.clone()
     nearer[0] *= 1.1  # view 0 believes everything to be nearer than the others do
     difference = agreement(nearer, warp, 0.03)[:, 2][inner]

@@ -209,9 +209,10 @@ def test_training_continues_from_its_state(scenes: list[Path], tmp_path: Path) -
     before = {name: value.clone() for name, value in training.net.state_dict().items()}
     terms = [training.update(samples[n]) for n in range(2)]
     assert all(np.isfinite(list(each.values())).all() for each in terms)
+    training.fallen = 1
     training.write(tmp_path, config)
     again = Training(config.training, tmp_path / STATE)
-    assert (again.step, again.here) == (2, 0)
+    assert (again.step, again.here, again.fallen) == (2, 0, 1)
     assert again.seconds == pytest.approx(training.seconds, abs=1)
     for name, value in training.net.state_dict().items():
         torch.testing.assert_close(again.net.state_dict()[name], value, rtol=1e-3, atol=1e-6)
@@ -272,25 +273,22 @@ def test_the_target_of_the_planes_is_in_the_row_that_holds_it(place: float) -> N
     assert float(plane_entropy(stage, torch.full_like(t, 0.5), torch.ones_like(t), rows=2).detach()) == 0
 
 
-def train(scenes: list[Path], out: Path, *options: str) -> tuple[str, dict[str, str]]:
-    """Runs the command; returns what it prints and the header of the weights of its fall."""
-    part = f"scenes.parts=[{{count: 2, first_seed: {int(scenes[0].stem.split('-')[0])}, size: [64, 128]}}]"
-    common = [f"scenes.folder={scenes[0].parent}", part, f"out={out}", "samples.shapes=[[2,48,96,1]]"]
-    command = [sys.executable, "-m", "recipes.sweep", *common, *options]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr[-3000:]
-    with safe_open(out / "cooled" / STATE, "pt") as file:
-        return done.stdout, file.metadata()
-
-
 @pytest.mark.slow
 def test_a_fall_of_the_rate_that_was_stopped_continues(scenes: list[Path], tmp_path: Path) -> None:
-    """Three steps, the first of them in a run that is stopped by its time; the state before the fall stays."""
-    said, made_of = train(scenes, tmp_path, "cooldown=3", "minutes=0.0001")
-    assert "step 0, 2 scenes" in said
-    assert (made_of["step"], made_of["fallen"]) == ("1", "1")
-    said, made_of = train(scenes, tmp_path, "cooldown=3")
-    assert "step 1, 2 scenes" in said
-    assert (made_of["step"], made_of["fallen"]) == ("3", "3")
-    assert not (tmp_path / STATE).exists()
+    """Three steps, the first of them in a run that is stopped by its time; the state that it began with stays."""
+    options = OmegaConf.create({"rate": 1e-3, "weight_decay": 0.02, "average": 0.5})
+    Training(options).write(tmp_path, OmegaConf.create())
+    kept = (tmp_path / STATE).read_bytes()
+    part = "scenes.parts=[{count: 2, first_seed: 5000000, size: [64, 128]}]"
+    common = [f"scenes.folder={scenes[0].parent}", part, f"out={tmp_path}", "samples.shapes=[[2,48,96,1]]"]
+    command = [sys.executable, "-m", "recipes.sweep", *common, "cooldown=3"]
+    for more, begun, made in ((["minutes=0.0001"], 0, 1), ([], 1, 3)):
+        done = subprocess.run([*command, *more], cwd=ROOT, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr[-3000:]
+        assert f"step {begun}, 2 scenes" in done.stdout
+        with safe_open(tmp_path / "cooled" / STATE, "pt") as file:
+            assert (file.metadata()["step"], file.metadata()["fallen"]) == (str(made), str(made))
+    assert (tmp_path / STATE).read_bytes() == kept
     SweepBackend(path=str(tmp_path / "cooled" / WEIGHTS))
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert "holds a fall of 3 steps, which is over: choose another out=" in done.stderr
