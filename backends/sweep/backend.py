@@ -26,8 +26,9 @@ _STATE = ("context", "context_fine", "swept", "origin")  # fields of the encodin
 class SweepBackend(Backend):
     """Plane-sweep multi-view stereo (needs cameras).
 
-    Every view is matched with six other views over all depths from a fraction of the cameras' distance to infinity;
-    what does not match is filled in, and two narrower stages refine the depth. A depth range in the hints is not used.
+    Every view is matched with up to six other views over all depths from a fraction of the cameras' distance to
+    infinity; what does not match is filled in, and two narrower stages refine the depth. Of the hints, only the cameras
+    are used.
     Depth has the unit of the camera translations. ``depth_conf`` is one over the expected relative error of depth.
 
     Args:

@@ -82,8 +82,7 @@ def correlate(features: Tensor, inverse: Tensor, warp: SourceWarp) -> tuple[Tens
     Returns:
         Similarity ``[V, n, D, h w, GROUPS]``, 0 outside the source, and whether points are inside ``[V, n, D, h w]``.
     """
-    compiled = features.device.type == "cpu" and features.dtype == torch.float32
-    if not compiled or torch.compiler.is_compiling():
+    if features.device.type != "cpu" or features.dtype != torch.float32:
         return correlate_reference(features, inverse, warp)
     return _Correlate.apply(features, inverse, warp)  # type: ignore[return-value]
 
@@ -109,7 +108,7 @@ class _Correlate(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, features: Tensor, inverse: Tensor, warp: SourceWarp) -> tuple[Tensor, Tensor]:
         """Returns similarity and whether points are inside."""
-        maps = features.permute(0, 2, 3, 1).contiguous()  # [V, h, w, C]
+        maps = features.permute(0, 2, 3, 1).contiguous()  # [N, h, w, C]
         views, sources = warp.sources.shape
         shape = (views, sources, *inverse.shape[1:])
         similarity = torch.empty(*shape, GROUPS)

@@ -40,8 +40,8 @@ class _InstanceNorm(nn.Module):
         """Normalises ``[N, C, h, w]`` over h and w."""
         centered = x - x.mean((2, 3), keepdim=True)
         variance = centered.square().mean((2, 3), keepdim=True)
-        scale = torch.rsqrt(variance.float() + 1e-5) * self.weight[:, None, None]
-        return centered * scale.to(x.dtype) + self.bias.to(x.dtype)[:, None, None]
+        scale = torch.rsqrt(variance + 1e-5) * self.weight[:, None, None]
+        return centered * scale + self.bias[:, None, None]
 
 
 def conv_norm(inputs: int, outputs: int, stride: int = 1, kernel: int = 3, relu: bool = True) -> nn.Sequential:
@@ -104,7 +104,7 @@ class FeaturePyramid(nn.Module):
 
 
 def unit_groups(x: Tensor) -> Tensor:
-    """Normalises every group of channels (equal c % GROUPS) of ``[N, C, h, w]`` to unit length, in float32."""
-    grouped = x.float().permute(0, 2, 3, 1).unflatten(-1, (-1, GROUPS))  # [N, h, w, C / GROUPS, GROUPS]
+    """Normalises every group of channels (equal c % GROUPS) of ``[N, C, h, w]`` to unit length."""
+    grouped = x.permute(0, 2, 3, 1).unflatten(-1, (-1, GROUPS))  # [N, h, w, C / GROUPS, GROUPS]
     length = grouped.square().sum(-2, keepdim=True).clamp_min(1e-6).sqrt()
     return (grouped / length).flatten(-2).permute(0, 3, 1, 2)

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from backends.sweep.correlate import GROUPS, SourceWarp, sample_at
 from vg2gt.kernels.compiled import kernel
 
-_HIDDEN = 16
+HIDDEN = 16  # channels between the two convolutions that weigh a similarity
 
 
 def fused_volume(
@@ -26,7 +26,7 @@ def fused_volume(
         maps: features of all views ``[N, C, h, w]``.
         inverse: inverse depths ``[V, D, h w]`` of the views of ``warp``.
         warp: correspondences of all or some of the views.
-        weigh: the weights of a similarity: 1x1 convolutions, GROUPS to 16 to 1 channels.
+        weigh: the weights of a similarity: 1x1 convolutions, GROUPS to HIDDEN to 1 channels.
         visible: visibility from the greatest score, the mean score and the greatest probability of a plane.
         given: visibility ``[V, n, h w]``; None computes it with ``visible``.
 
@@ -39,6 +39,7 @@ def fused_volume(
     volume = torch.empty(views, planes, pixels, GROUPS + 1)
     seen = torch.empty(views, sources, pixels) if given is None else given.contiguous()
     tensors = (channels_last, warp.sources, warp.at_infinity, warp.parallax, inverse)
+    assert given is not None or visible is not None
     weight, bias, weight_out, bias_out = weigh.parameters()
     last = (visible.weight[0], visible.bias) if visible else (torch.zeros(3), torch.zeros(1))
     layers = (weight.flatten(1).T, bias, weight_out.flatten(), bias_out, *last)
@@ -58,7 +59,7 @@ def _fused(geometry, network, first, estimate, volume, seen):
     similarity = np.empty((count, planes, GROUPS), np.float32)
     score = np.empty((count, planes), np.float32)  # of the source at the plane
     within = np.empty((count, planes), np.float32)
-    hidden = np.empty(_HIDDEN, np.float32)
+    hidden = np.empty(HIDDEN, np.float32)
     for view in range(sources.shape[0]):
         for p in range(height * width):
             here = maps[first + view, p // width, p % width]
@@ -78,13 +79,13 @@ def _fused(geometry, network, first, estimate, volume, seen):
                             for g in range(GROUPS):
                                 k = c + g
                                 out[g] += here[k] * (w00 * f00[k] + w01 * f01[k] + w10 * f10[k] + w11 * f11[k])
-                    for k in range(_HIDDEN):
+                    for k in range(HIDDEN):
                         hidden[k] = bias1[k]
                     for g in range(GROUPS):
-                        for k in range(_HIDDEN):
+                        for k in range(HIDDEN):
                             hidden[k] += out[g] * weight1[g, k]
                     total = bias2[0]
-                    for k in range(_HIDDEN):
+                    for k in range(HIDDEN):
                         total += max(hidden[k], np.float32(0.0)) * weight2[k]
                     score[n, d] = total
                 if estimate:

@@ -11,16 +11,14 @@ from torch.nn import functional as F
 
 from backends.sweep.correlate import SourceWarp
 from backends.sweep.features import CONTEXT_COARSE, FeaturePyramid, Features
-from backends.sweep.planes import FARTHEST, Planes, baselines, fine_sources
+from backends.sweep.planes import FARTHEST, PLANES, Planes, baselines, fine_sources
 from backends.sweep.refine import CELLS, DepthHead, PlainBlock, RefineNet, activate, convex_upsample, slices
 from backends.sweep.stage import Matching, Stage
 from backends.sweep.tokens import DIM, PATCH, POSITION_CHANNELS, TAPS, TokenBlock, attend, patch_places
 from backends.sweep.views import relative_poses
 from backends.sweep.volume import agreement
 from vg2gt.geometry.cameras import resize_intrinsics
-from vg2gt.geometry.precision import full_precision
 
-PLANES = 64
 _SPACING = 1 / (PLANES - 1)
 _QUARTER, _HALF = (16, 0.25 * _SPACING), (8, 0.1 * _SPACING)  # planes of a row, and spacing, of the later stages
 ROWS = (1, 2, 1)  # rows of planes of the stages
@@ -30,23 +28,21 @@ _AGREEMENT = (0.1, 0.05)  # widths of the agreement at 1/8 and 1/4
 _FARTHEST_MATCHED, _BEYOND = 0.95, 1.5  # quantile of the matched depth of a scene, and the greatest depth over it
 _BINS = 16  # channels that hold the summed probability of the planes
 _STATED = 1 + 1 + 3 + _BINS  # relative log-depth, mass, agreement, bins
-_SEEN = 32  # channels of the U-Net that the tokens see
+_SHOWN = 32  # channels of the U-Net that the tokens see
 
 
 class PosedViews(NamedTuple):
-    """V views of one scene, or of several scenes with the same number of views each (training).
+    """V views of one scene.
 
     Attributes:
         images: ``[V, 3, H, W]`` in [0, 1], H and W multiples of 8.
         world_to_camera: ``[V, 4, 4]``.
         intrinsics: ``[V, 3, 3]`` in pixels, integer pixel centres.
-        scenes: number of scenes; views of one scene are consecutive.
     """
 
     images: Tensor
     world_to_camera: Tensor
     intrinsics: Tensor
-    scenes: int = 1
 
     @property
     def size(self) -> tuple[int, int]:
@@ -55,9 +51,8 @@ class PosedViews(NamedTuple):
 
     def warp(self, maps: Tensor, sources: Tensor, stride: int) -> SourceWarp:
         """Returns the correspondences of feature maps at ``1 / stride`` of the images with sources ``[V, n]``."""
-        with full_precision(maps):  # half is off by pixels
-            intrinsics = resize_intrinsics(self.intrinsics, 1 / stride, 1 / stride)
-            return SourceWarp(self.world_to_camera, intrinsics, sources, (maps.shape[-2], maps.shape[-1]))
+        intrinsics = resize_intrinsics(self.intrinsics, 1 / stride, 1 / stride)
+        return SourceWarp(self.world_to_camera, intrinsics, sources, (maps.shape[-2], maps.shape[-1]))
 
 
 class SweepEncoding(NamedTuple):
@@ -92,9 +87,9 @@ class SweepNet(nn.Module):
         super().__init__()
         self.features = FeaturePyramid()
         self.matching = nn.ModuleList(Matching(channels, level == 0) for level, channels in enumerate(_CHANNELS))
-        self.refine = RefineNet(CONTEXT_COARSE + _STATED, 3 + 36 + _SEEN)
+        self.refine = RefineNet(CONTEXT_COARSE + _STATED, 3 + 36 + _SHOWN)
         self.embed = nn.Sequential(
-            nn.Linear(4 * CONTEXT_COARSE + _STATED + 3 + _SEEN, 2 * DIM), nn.GELU(), nn.Linear(2 * DIM, DIM)
+            nn.Linear(4 * CONTEXT_COARSE + _STATED + 3 + _SHOWN, 2 * DIM), nn.GELU(), nn.Linear(2 * DIM, DIM)
         )
         self.position = nn.Linear(POSITION_CHANNELS, DIM)
         self.blocks = nn.ModuleList(TokenBlock(DIM, 4, i % 2 == 1, 2 + 2 * (i % 2)) for i in range(4))
@@ -119,11 +114,11 @@ class SweepNet(nn.Module):
 
         Args:
             features: features of ``views.images``.
-            views: views of one or more scenes.
+            views: the views.
             sources: indices of the sources of each view at 1/8 ``[V, n]``.
             shown: 0 where a view is matched with no source (training), else 1, ``[V, 1, H / 8, W / 8]``.
         """
-        unit = baselines(views.world_to_camera, views.scenes)
+        unit = baselines(views.world_to_camera)
         planes = Planes(unit)
         # all depths at 1/8
         warp = views.warp(features.match[0], sources, 8)
@@ -134,8 +129,8 @@ class SweepNet(nn.Module):
         if shown is not None:
             agreeing = agreeing * shown
         reliable = first.mass.detach() * agreeing[:, 1:2]
-        scale = _scene_quantile(matched.detach(), reliable, views.scenes, 0.5)  # [V, 1, 1, 1]
-        farthest = _scene_quantile(matched.detach(), reliable, views.scenes, _FARTHEST_MATCHED) + math.log(_BEYOND)
+        scale = _weighted_quantile(matched.detach(), reliable, 0.5)
+        farthest = _weighted_quantile(matched.detach(), reliable, _FARTHEST_MATCHED) + math.log(_BEYOND)
         # what does not match is filled in: U-Net, then attention
         bins = slices(first.logits.softmax(1), _BINS)
         stated = torch.cat((matched - scale, first.mass, agreeing, bins), 1)
@@ -151,14 +146,11 @@ class SweepNet(nn.Module):
             guess = scale + change[:, 1:2]
             share = torch.sigmoid(sure + change[:, 2:])
             center = share * (matched + 0.1 * change[:, :1]) + (1 - share) * guess
-            if (
-                not torch.is_grad_enabled()
-            ):  # walls without texture were taken for sky in rooms unlike those of training
-                center = torch.minimum(center, farthest)
-            return center, guess, share
+            # walls without texture were taken for sky in rooms unlike those of training
+            return center if self.training else torch.minimum(center, farthest), guess, share
 
         place = self._places(blend(change)[0], scale, views, grid)
-        tokens = attend(self.blocks[:2], tokens, place, grid, views.scenes)[-1]
+        tokens = attend(self.blocks[:2], tokens, place, grid)[-1]
         filled = F.pad(self.fill(tokens).mT.unflatten(-1, grid), (0, 0, 0, 0, 1, 0))
         center, guess, share = blend(change + filled)
         # twice more, around that, with the best sources
@@ -174,23 +166,23 @@ class SweepNet(nn.Module):
         agreeing = agreement((-log_depth).exp().detach(), warp, _AGREEMENT[1])
         known = torch.cat((log_depth - scale, second.mass, agreeing, log_depth - quarter), 1)
         found = self.begin(torch.cat((features.context, known), 1))
-        found = self.end(activate(self.block(found))).float()
+        found = self.end(activate(self.block(found)))
         half = convex_upsample(log_depth + 0.1 * found[:, :1], found[:, 1:])
         third, _ = self._narrow(2, half, _HALF, features, planes, views.warp(features.match[2], best, 2), visible)
         log_depth = -planes.inverse(third.t).log()
         fine = F.pixel_unshuffle(torch.cat((log_depth - scale, third.mass), 1), 4)
         tokens = tokens + self.embed_fine(torch.cat((F.pixel_unshuffle(known, 2), fine), 1).flatten(2).mT)
         place = self._places(F.avg_pool2d(log_depth, 4), scale, views, grid)
-        taps = attend(self.blocks[2:], tokens, place, grid, views.scenes)
+        taps = attend(self.blocks[2:], tokens, place, grid)
         sure = F.interpolate(torch.cat((F.avg_pool2d(second.mass, 2), share), 1), size=log_depth.shape[-2:])
         swept = torch.cat((log_depth, third.mass, sure), 1)
         stages, centers = (first, second, third), (center, quarter, half)
         return SweepEncoding(
-            tuple(tap.float() for tap in taps[-TAPS:]),
+            taps[-TAPS:],
             features.context,
             features.context_fine,
             swept,
-            taps[-1][..., : CELLS**2].float(),
+            taps[-1][..., : CELLS**2],
             stages,
             guess,
             centers,
@@ -258,17 +250,12 @@ class SweepNet(nn.Module):
 
     def _places(self, log_depth: Tensor, scale: Tensor, views: PosedViews, grid: tuple[int, int]) -> Tensor:
         """Embedded positions of the patches, at the given log-depth, in units of the scene's matched depth."""
-        depth, unit = log_depth.detach().flatten(1).exp(), scale.flatten().exp()
-        with full_precision(depth):
-            cameras = (views.world_to_camera, views.intrinsics)
-            place = patch_places(depth, *cameras, unit, grid, views.scenes)
-        return self.position(place)
+        depth = log_depth.detach().flatten(1).exp()
+        return self.position(patch_places(depth, views.world_to_camera, views.intrinsics, scale.exp(), grid))
 
 
-def _scene_quantile(log_depth: Tensor, weight: Tensor, scenes: int, share: float) -> Tensor:
-    """Weighted quantile of the log-depth of each scene, ``[V, 1, 1, 1]``."""
-    views = len(log_depth) // scenes
-    values, order = log_depth.reshape(scenes, -1).sort(1)
-    mass = (weight.reshape(scenes, -1) + 1e-4).gather(1, order).cumsum(1)
-    place = (mass < share * mass[:, -1:]).sum(1, keepdim=True)
-    return values.gather(1, place).repeat_interleave(views, 0).view(-1, 1, 1, 1)
+def _weighted_quantile(values: Tensor, weight: Tensor, share: float) -> Tensor:
+    """Weighted quantile of all values, a scalar."""
+    values, order = values.flatten().sort()
+    mass = (weight.flatten() + 1e-4)[order].cumsum(0)
+    return values[(mass < share * mass[-1]).sum()]

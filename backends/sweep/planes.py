@@ -1,4 +1,4 @@
-"""Depth planes that need no depth range, and the choice of sources."""
+"""Depth planes that need no depth range, and the sources of views."""
 
 from __future__ import annotations
 
@@ -14,27 +14,30 @@ COARSE_SOURCES, _FINE_SOURCES = 6, 3
 _NEAREST = 0.15  # depth of the nearest plane, in baselines
 _BEND = 40.0  # planes nearer than this many baselines are spaced in log-depth, farther ones in inverse depth
 _SPAN = math.log1p(_BEND / _NEAREST)
-FARTHEST = 0.1 / 63  # smallest position of a hypothesis: thousands of baselines away
+PLANES = 64  # of the first stage
+FARTHEST = 0.1 / (PLANES - 1)  # smallest position of a hypothesis: thousands of baselines away
 _SCORED = (0.7, 30.0)  # near and far, in baselines, of the points whose visibility scores the sources
 _LEAST_BASELINE = 0.02  # in units of the largest distance between cameras
 _ENOUGH_PARALLAX, _WIDE_PARALLAX = 0.06, 0.4  # baseline over depth: see fine_sources
-_SEEN = 0.6  # share of its weight that a pixel loses with every source that sees it
+_SEEN_AGAIN = 0.6  # share of its weight that a pixel loses with every source that sees it
 
 
-def baselines(world_to_camera: Tensor, scenes: int = 1) -> Tensor:
+def baselines(world_to_camera: Tensor) -> Tensor:
     """Returns the unit of length of each view's planes ``[V]``: the median distance to its nearest cameras.
 
+    If that is too short, because the camera rested, only cameras farther away count.
+
     Args:
-        world_to_camera: ``[V, 4, 4]``; views of one scene are consecutive.
-        scenes: number of scenes.
+        world_to_camera: ``[V, 4, 4]``, not all in one place.
     """
-    units = []
-    for poses in world_to_camera.chunk(scenes):
-        distances = camera_distances(poses)
-        extent = distances.max()
-        others = distances.fill_diagonal_(torch.inf).sort(1).values[:, : min(COARSE_SOURCES, len(poses) - 1)]
-        units.append(others.median(1).values.clamp_min(_LEAST_BASELINE * extent))
-    return torch.cat(units)
+    distances = camera_distances(world_to_camera)
+    least = _LEAST_BASELINE * distances.max()
+    others = distances.fill_diagonal_(torch.inf)
+    count = min(COARSE_SOURCES, len(others) - 1)
+    nearest = others.sort(1).values[:, :count].median(1).values
+    apart = others.masked_fill(others < least, torch.inf).sort(1).values[:, :count]
+    middle = (apart.isfinite().sum(1, keepdim=True) - 1) // 2
+    return torch.where(nearest < least, apart.gather(1, middle)[:, 0], nearest)
 
 
 def coarse_sources(
@@ -69,7 +72,7 @@ def fine_sources(visible: Tensor, parallax: Tensor, count: int = _FINE_SOURCES) 
             total = total.scatter(1, before[:, None], -torch.inf)
         chosen.append(total.argmax(1))
         best = visible.gather(1, chosen[-1][:, None, None].expand(-1, 1, visible.shape[2]))[:, 0]
-        left = left * (1 - _SEEN * best)
+        left = left * (1 - _SEEN_AGAIN * best)
     return torch.stack(chosen, 1)
 
 

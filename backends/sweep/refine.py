@@ -58,12 +58,12 @@ class RefineNet(nn.Module):
         nn.init.zeros_(self.end.bias)  # type: ignore[arg-type]
 
     def forward(self, x: Tensor) -> Tensor:
-        """Maps ``[N, inputs, h, w]`` to ``[N, outputs, h, w]`` in float32."""
+        """Maps ``[N, inputs, h, w]`` to ``[N, outputs, h, w]``."""
         fine = self.begin(x)
         middle = self.down(activate(fine))
         middle = self.merge(middle + upsample(self.up(self.bottom(activate(middle))), middle))
         fine = self.merge_fine(fine + upsample(self.up_fine(middle), fine))
-        return self.end(activate(fine)).float()
+        return self.end(activate(fine))
 
 
 def convex_upsample(x: Tensor, mask: Tensor) -> Tensor:
@@ -132,8 +132,8 @@ class DepthHead(nn.Module):
         x, correction = (upsample(each, swept) for each in (x, correction))
         center = swept[:, :1].mean((-1, -2), keepdim=True)
         x = activate(self.fine(torch.cat((x, context_fine, swept[:, :1] - center, swept[:, 1:]), 1)))
-        log_depth, log_scale = self.out(x).float().chunk(2, 1)
-        log_depth = swept[:, :1] + RESPONSE * correction.float() + 0.25 * log_depth
+        log_depth, log_scale = self.out(x).chunk(2, 1)
+        log_depth = swept[:, :1] + RESPONSE * correction + 0.25 * log_depth
         both = torch.cat((log_depth, log_scale + _UNSURE), 1)
-        full = convex_upsample(both, self.mask(x).float())
+        full = convex_upsample(both, self.mask(x))
         return full[:, 0].clamp(-_LOG_DEPTH, _LOG_DEPTH).exp(), full[:, 1]

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from backends.sweep.correlate import GROUPS, SourceWarp, correlate
-from backends.sweep.fused import fused_volume
+from backends.sweep.fused import HIDDEN, fused_volume
 from backends.sweep.planes import Planes
 from backends.sweep.volume import VolumeNet, chunks_of_views, expectation, mean_similarity
 
@@ -42,7 +42,7 @@ class Matching(nn.Module):
 
     def __init__(self, channels: int, estimates: bool) -> None:
         super().__init__()
-        self.weigh = nn.Sequential(nn.Conv2d(GROUPS, 16, 1), nn.ReLU(inplace=True), nn.Conv2d(16, 1, 1))
+        self.weigh = nn.Sequential(nn.Conv2d(GROUPS, HIDDEN, 1), nn.ReLU(inplace=True), nn.Conv2d(HIDDEN, 1, 1))
         self.visible = nn.Linear(3, 1) if estimates else None
         self.volume = VolumeNet(channels)
         if self.visible:
@@ -88,14 +88,14 @@ class Matching(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Mean similarity per group and mean weight ``[V D, GROUPS + 1, h, w]``, and visibility ``[V, n, h, w]``."""
         size, (views, sources) = (maps.shape[-2], maps.shape[-1]), warp.sources.shape
-        compiled = maps.device.type == "cpu" and maps.dtype == torch.float32 and not torch.compiler.is_compiling()
+        compiled = maps.device.type == "cpu" and maps.dtype == torch.float32
         if compiled and not torch.is_grad_enabled() and shown is None:
             given = None if visible is None else visible.flatten(2)
             volume, visible = fused_volume(maps, inverse, warp, self.weigh, self.visible, given)
             return volume.view(-1, *size, GROUPS + 1).permute(0, 3, 1, 2), visible.unflatten(2, size)
         similarity, inside = correlate(maps, inverse, warp)  # [V, n, D, h w, G]
         images = similarity.reshape(-1, *size, GROUPS).permute(0, 3, 1, 2)
-        score = self.weigh(images).float().reshape(inside.shape)  # [V, n, D, h w]
+        score = self.weigh(images).reshape(inside.shape)  # [V, n, D, h w]
         if visible is None:
             assert self.visible is not None
             distinct = torch.stack((score.amax(2), score.mean(2), score.softmax(2).amax(2)), -1)

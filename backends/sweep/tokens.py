@@ -29,21 +29,20 @@ class TokenBlock(nn.Module):
         self.query, self.key_value, self.out = nn.Linear(dim, dim), nn.Linear(dim, 2 * dim), nn.Linear(dim, dim)
         self.mlp = nn.Sequential(nn.Linear(dim, 3 * dim), nn.GELU(), nn.Linear(3 * dim, dim))
 
-    def forward(self, x: Tensor, position: Tensor, grid: tuple[int, int], scenes: int = 1) -> Tensor:
+    def forward(self, x: Tensor, position: Tensor, grid: tuple[int, int]) -> Tensor:
         """Maps tokens ``[V, P, dim]`` to the same shape.
 
         Args:
             x: tokens ``[V, P, dim]``.
             position: position embeddings ``[V, P, dim]``.
             grid: patches per axis.
-            scenes: number of scenes that the views belong to.
         """
         views, patches, dim = x.shape
         placed = self.norm(x) + position
         query = self.query(placed)
         keys = F.avg_pool2d(placed.mT.unflatten(-1, grid), self.pool, ceil_mode=True).flatten(2).mT
         if self.across:
-            query, keys = query.reshape(scenes, -1, dim), keys.reshape(scenes, -1, dim)
+            query, keys = query.reshape(1, -1, dim), keys.reshape(1, -1, dim)
         parts = (query, *self.key_value(keys).chunk(2, -1))
         split = [part.unflatten(-1, (self.heads, -1)).transpose(1, 2) for part in parts]  # [., heads, P, dim/heads]
         attended = F.scaled_dot_product_attention(*split).transpose(1, 2).flatten(2).reshape(views, patches, dim)
@@ -51,13 +50,11 @@ class TokenBlock(nn.Module):
         return x + self.mlp(self.norm_mlp(x))
 
 
-def attend(
-    blocks: nn.ModuleList, tokens: Tensor, position: Tensor, grid: tuple[int, int], scenes: int
-) -> tuple[Tensor, ...]:
+def attend(blocks: nn.ModuleList, tokens: Tensor, position: Tensor, grid: tuple[int, int]) -> tuple[Tensor, ...]:
     """Runs blocks one after the other; returns the outputs of all. Arguments as in :meth:`TokenBlock.forward`."""
     outputs = []
     for block in blocks:
-        tokens = block(tokens, position, grid, scenes)
+        tokens = block(tokens, position, grid)
         outputs.append(tokens)
     return tuple(outputs)
 
@@ -68,7 +65,6 @@ def patch_places(
     intrinsics: Tensor,
     unit: Tensor,
     size: tuple[int, int],
-    scenes: int = 1,
 ) -> Tensor:
     """Encodes the positions of patches: 3D point and ray in the first view's frame, and position in the image.
 
@@ -76,17 +72,15 @@ def patch_places(
         depth: depth of the patches ``[V, P]``.
         world_to_camera: ``[V, 4, 4]``.
         intrinsics: ``[V, 3, 3]``, at image resolution.
-        unit: unit of length, equal for all views of a scene ``[V]``.
+        unit: unit of length, a scalar.
         size: patches per axis.
-        scenes: number of scenes that the views belong to.
 
     Returns:
         ``[V, P, POSITION_CHANNELS]``.
     """
-    views = len(world_to_camera) // scenes
-    pose = world_to_camera[::views].repeat_interleave(views, 0) @ torch.linalg.inv(world_to_camera)
+    pose = world_to_camera[:1] @ torch.linalg.inv(world_to_camera)
     ray = rays(resize_intrinsics(intrinsics, 1 / PATCH, 1 / PATCH), size)  # [V, 3, P]
-    point = (pose[:, :3, :3] @ (ray * depth[:, None]) + pose[:, :3, 3:]) / unit[:, None, None]
+    point = (pose[:, :3, :3] @ (ray * depth[:, None]) + pose[:, :3, 3:]) / unit
     direction = F.normalize(pose[:, :3, :3] @ ray, dim=1)
     waves = [wave(point * number) for number in _WAVENUMBERS for wave in (torch.sin, torch.cos)]
     rows, columns = (torch.linspace(0, 1, steps, device=depth.device) for steps in size)

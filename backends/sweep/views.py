@@ -1,6 +1,8 @@
-"""Choice of source views from the cameras."""
+"""Geometry of the cameras, and the choice of source views from them."""
 
 from __future__ import annotations
+
+import math
 
 import torch
 from torch import Tensor
@@ -11,6 +13,9 @@ _GRID = (5, 9)  # rays per view for measuring overlap
 _DEPTHS = 5  # planes between near and far for measuring overlap
 # baseline over depth: too little parallax below the first, too different views above the second
 _LEAST_PARALLAX, _MOST_PARALLAX = 0.08, 0.5
+# cameras nearer than this, relative to the largest distance between cameras, count as in one place
+_ONE_PLACE = 0.01
+_SAME_DIRECTION = math.cos(math.radians(5))
 _SEEN_AGAIN = 0.4  # factor on a point's score for every source that already sees it
 
 
@@ -42,7 +47,9 @@ def choose_sources(
     """Chooses the source views that every view is matched with, greedily.
 
     The score of a source is its overlap with the view between near and far, times a reward for parallax that decreases
-    again for wide baselines. Points that already chosen sources see count less.
+    again for wide baselines. Points that already chosen sources see count less. Views from the same place have no
+    parallax and are never sources of each other, and of those that show the same only one is a source. A view with too
+    few sources has its best one several times.
 
     Args:
         world_to_camera: ``[V, 4, 4]``.
@@ -58,20 +65,26 @@ def choose_sources(
     views = len(world_to_camera)
     inside, poses, depths = _seen_by(world_to_camera, intrinsics, size, depth_range)
     # reward for parallax: [V, s]
-    parallax = poses[..., :3, 3].norm(dim=-1) / depths[:, _DEPTHS // 2, None]
+    distances = poses[..., :3, 3].norm(dim=-1)
+    parallax = distances / depths[:, _DEPTHS // 2, None]
     reward = parallax / (parallax + _LEAST_PARALLAX) / (1 + (parallax / _MOST_PARALLAX) ** 2)
     if noise is not None:
         reward = reward * torch.exp(noise)
     seen = inside.float()  # [V, s, z p]
     left = torch.ones_like(seen[:, 0])  # [V, z p] weights of the points for the next source
-    reward = reward.masked_fill(torch.eye(views, dtype=torch.bool, device=reward.device), -torch.inf)
+    together = distances <= _ONE_PLACE * distances.max()
+    together |= torch.eye(views, dtype=torch.bool, device=reward.device)
+    cosine = (torch.einsum("vij,sij->vs", world_to_camera[:, :3, :3], world_to_camera[:, :3, :3]) - 1) / 2
+    copies = together & (cosine > _SAME_DIRECTION)
+    reward = reward.masked_fill(together, -torch.inf)
     chosen, everyone = [], torch.arange(views, device=seen.device)
     for _ in range(min(count, views - 1)):
         score = (seen * left[:, None]).mean(-1).clamp_min(1e-6) * reward  # [V, s]
-        best = score.argmax(1)
-        chosen.append(best)
+        most, best = score.max(1)
+        chosen.append(torch.where(most.isfinite(), best, chosen[0]) if chosen else best)
+        best = chosen[-1]
         left = left * torch.where(seen[everyone, best] > 0, _SEEN_AGAIN, 1.0)
-        reward = reward.scatter(1, best[:, None], -torch.inf)
+        reward = reward.masked_fill(copies[best], -torch.inf)
     return torch.stack(chosen, 1)
 
 

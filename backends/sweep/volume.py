@@ -68,14 +68,15 @@ class VolumeNet(nn.Module):
         self.sharpness = nn.Parameter(torch.tensor(6.0))  # adds the similarity to the logits, also before training
 
     def forward(self, volume: Tensor, planes: int) -> Tensor:
-        """Maps ``[V D, GROUPS + 1, h, w]`` to logits ``[V, D, h, w]`` in float32."""
+        """Maps ``[V D, GROUPS + 1, h, w]`` to logits ``[V, D, h, w]``."""
         x = F.relu(self.first(F.relu(self.begin(volume), inplace=True), planes), inplace=True)
-        y = F.relu(self.down(x), inplace=True)
-        for block in self.coarse:
-            y = F.relu(block(y, planes), inplace=True)
-        x = F.relu(upsample(self.up(y), x).add_(x), inplace=True)
+        if min(x.shape[-2:]) > 1:  # images of 8 pixels have no half resolution
+            y = F.relu(self.down(x), inplace=True)
+            for block in self.coarse:
+                y = F.relu(block(y, planes), inplace=True)
+            x = F.relu(upsample(self.up(y), x).add_(x), inplace=True)
         similarity = volume.permute(0, 2, 3, 1)[..., :GROUPS].mean(-1)  # [V D, h, w]
-        logits = 4 * self.end(self.last(x, planes)).float() + self.sharpness * similarity[:, None]
+        logits = 4 * self.end(self.last(x, planes)) + self.sharpness * similarity[:, None]
         return logits.view(-1, planes, *volume.shape[-2:])
 
 

@@ -53,8 +53,7 @@ class Training:
         self.net: Any = SweepNet().to(self.device, memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
         self.averaged = {name: value.detach().clone().float() for name, value in self.net.state_dict().items()}
         if state:
-            with safe_open(state, "pt") as file:
-                metadata = file.metadata()
+            metadata = _header(state)
             self.step, self.seconds = int(metadata.get("step", 0)), float(metadata.get("seconds", 0))
             self.fallen = int(metadata.get("fallen", 0))
             tensors = load_file(state, device)
@@ -113,21 +112,50 @@ class Training:
         write_bytes(out / STATE, save(own, metadata=made_of | {"fallen": str(self.fallen)}))
 
 
+def _header(file: Path) -> dict[str, str]:
+    with safe_open(file, "pt") as opened:
+        return opened.metadata() or {}
+
+
+def begun_with(config: DictConfig) -> tuple[Path, Path | None]:
+    """Returns the folder to write to, and the state to continue from; None: random weights.
+
+    Raises:
+        FileNotFoundError: if ``begin`` does not exist, or there is no state from which the rate could fall.
+        ValueError: if the fall in the folder is over, or began from another state than the one that is there.
+    """
+    base, begin = Path(config.out) / STATE, Path(config.begin) if config.begin else None
+    known = next((file for file in (base, begin) if file and file.is_file()), None)
+    if begin and known is None:
+        raise FileNotFoundError(f"begin={begin} does not exist")
+    if not config.cooldown:
+        return base.parent, known
+    out = base.parent / "cooled"
+    if (out / STATE).is_file():
+        header = _header(out / STATE)
+        fallen = int(header["fallen"])
+        if fallen >= config.cooldown:
+            raise ValueError(
+                f"{out} holds a fall of {fallen} steps, which is over: move it away"
+            )
+        first = int(header["step"]) - fallen
+        if known and int(_header(known).get("step", 0)) != first:
+            raise ValueError(f"{out} holds a fall from step {first}, not from {known}: move it away")
+        return out, out / STATE
+    if known is None:
+        raise FileNotFoundError(f"{base} does not exist: give a state from which the rate falls, begin=FILE")
+    return out, known
+
+
 @hydra.main(config_path=".", config_name="train", version_base="1.3")
 def main(config: DictConfig) -> None:
-    """Trains for ``minutes``, or until the process is told to stop."""
+    """Trains for ``minutes``, for ``cooldown`` steps, or until the process is told to stop."""
     torch.set_num_threads(config.threads)
     torch.manual_seed(config.seed)
-    out = Path(config.out) / "cooled" if config.cooldown else Path(config.out)
+    out, begun = begun_with(config)
     out.mkdir(parents=True, exist_ok=True)
-    states = [out / STATE, Path(config.out) / STATE, *([Path(config.begin)] if config.begin else [])]
-    begun = next((file for file in states if file.is_file()), None)
-    if config.begin and begun is None:
-        raise FileNotFoundError(f"begin={config.begin} does not exist")
     training = Training(config.training, begun, config.device)
     training.fallen = training.fallen if begun == out / STATE else 0  # another fall may have made what this begins with
-    if config.cooldown and training.fallen >= config.cooldown:
-        raise ValueError(f"{out} holds a fall of {training.fallen} steps, which is over: choose another out=")
     files = [file for part in config.scenes.parts for file in scene_files(config.scenes.folder, **part)]
     files = [file for file in files if file.is_file()] if config.scenes.rendered else files
     if not files:

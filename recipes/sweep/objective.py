@@ -6,16 +6,16 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from backends.sweep.network import PLANES, ROWS, SweepEncoding
-from backends.sweep.planes import Planes, baselines
+from backends.sweep.network import ROWS, SweepEncoding
+from backends.sweep.planes import PLANES, Planes, baselines
 from backends.sweep.stage import Stage
 from recipes.sweep.samples import Sample
 
 _CLAMP, _SLOPE = 2.0, 0.2  # log-depth errors above this count by the slope only
-_BEYOND = 1.5 / (PLANES - 1)  # position from which on any greater depth counts as correct, as for sky
+_SKY_BELOW = 1.5 / (PLANES - 1)  # position from which on any greater depth counts as correct, as for sky
 _ROOM = 1.0  # up to this much log-depth farther, so that depth does not diverge
 _BEYOND_ERROR = 0.7  # minimum relative error that the uncertainty of such pixels is trained on
-WEIGHTS = {
+_TERM_WEIGHTS = {
     "depth": 2.0,
     "uncertainty": 0.15,
     "gradient": 1.0,
@@ -41,7 +41,7 @@ def objective(
         The weighted sum, and its unweighted terms.
     """
     planes = Planes(baselines(sample.world_to_camera))
-    farthest = planes.inverse(torch.full_like(sample.depth[:, None, :1, :1], _BEYOND)).reciprocal()  # [V, 1, 1, 1]
+    farthest = planes.inverse(torch.full_like(sample.depth[:, None, :1, :1], _SKY_BELOW)).reciprocal()  # [V, 1, 1, 1]
     known = (sample.depth > 0).float()
     error, beyond = _log_error(depth.log()[:, None], sample.depth[:, None], farthest)
     error, beyond = error[:, 0], beyond[:, 0]
@@ -49,9 +49,9 @@ def objective(
     valid = known * ~beyond
     log_scale = log_scale.clamp(-6, 1)
     terms = {
-        "depth": mean(_limited(error), known * sample.weight),
-        "uncertainty": mean(stated * torch.exp(-log_scale) + log_scale, known),
-        "gradient": sum((gradient(error[:, ::k, ::k], valid[:, ::k, ::k]) for k in (1, 2, 4)), torch.zeros(())),
+        "depth": _mean(_limited(error), known * sample.weight),
+        "uncertainty": _mean(stated * torch.exp(-log_scale) + log_scale, known),
+        "gradient": sum((_gradient(error[:, ::k, ::k], valid[:, ::k, ::k]) for k in (1, 2, 4)), torch.zeros(())),
     }
     sums: dict[str, list[Tensor]] = {"planes": [], "stages": [], "centers": [], "guess": []}
     for stage, center, cell, rows in zip(encoding.stages, encoding.centers, (8, 4, 2), ROWS, strict=True):
@@ -63,9 +63,9 @@ def objective(
         looked = {"stages": found, "centers": center} | ({"guess": encoding.guess} if cell == 8 else {})
         for name, log_depth in looked.items():
             off = _limited(_log_error(log_depth, truth, farthest)[0])
-            sums[name].append(mean(off, seen if name == "stages" else weight))
+            sums[name].append(_mean(off, seen if name == "stages" else weight))
     terms |= {name: torch.stack(values).sum() for name, values in sums.items()}
-    return torch.stack([WEIGHTS[name] * term for name, term in terms.items()]).sum(), terms
+    return torch.stack([_TERM_WEIGHTS[name] * term for name, term in terms.items()]).sum(), terms
 
 
 def cell_inverse(depth: Tensor, cell: int) -> tuple[Tensor, Tensor]:
@@ -83,12 +83,12 @@ def cell_inverse(depth: Tensor, cell: int) -> tuple[Tensor, Tensor]:
     return torch.where(known, inverse, 1.0), known.float()
 
 
-def mean(values: Tensor, weights: Tensor) -> Tensor:
+def _mean(values: Tensor, weights: Tensor) -> Tensor:
     """Returns the weighted mean; weights that sum to less than 1 count as if they did to 1."""
     return (values * weights).sum() / weights.sum().clamp_min(1)
 
 
-def gradient(error: Tensor, valid: Tensor) -> Tensor:
+def _gradient(error: Tensor, valid: Tensor) -> Tensor:
     """Returns the mean absolute difference of neighbouring errors; invariant to the scale of depth."""
     down = (error[:, 1:] - error[:, :-1]).abs().clamp_max(1) * valid[:, 1:] * valid[:, :-1]
     right = (error[:, :, 1:] - error[:, :, :-1]).abs().clamp_max(1) * valid[:, :, 1:] * valid[:, :, :-1]

@@ -18,14 +18,14 @@ from torch.nn import functional as F
 from torch.utils.data import Dataset
 
 from backends.sweep.planes import COARSE_SOURCES, coarse_sources
-from recipes.sweep.scenes import SceneFrames, read_scene
+from recipes.sweep.scenes import FRAMES, SceneFrames, read_scene
 from vg2gt.geometry.cameras import crop_intrinsics, project, resize_intrinsics, rigid_motions, unproject
 from vg2gt.metrics.kinds import pixel_kinds
 from vg2gt.types import Cameras
 
 _UPRIGHT_SHARE = 0.3  # of samples rotated by 90 degrees to portrait format
 _LEAST_OVERLAP = 0.15
-_WALK_FRAMES, _WALK_STEP = 14, math.radians(9)  # maximum frames and median rotation between frames of a walk
+_WALK_STEP = math.radians(9)  # maximum median rotation between frames of a walk
 _FEWER_SHARE = 0.4  # of samples whose views have fewer sources than the network would take
 _ORPHAN_SHARE = 0.2  # of samples in which views, or a region of them, are matched with no source
 _ALONE, _BARE = 1.0, 0.5  # added to the weight of pixels that no other view sees, and of those without texture
@@ -33,6 +33,7 @@ _SOURCE_NOISE = 0.4  # on log-scores, so that training also sees pairs other tha
 _POSE_SHARE, _TURN, _SHIFT = 0.5, 0.0015, 0.002  # share of samples with pose noise; rad; in depths
 _LEAST_PIXELS = 5000  # with known depth, of four views of 80x160; samples with fewer are drawn again
 _GREY_SHARE = 0.2
+_DRAWS = 100
 
 
 class Crop(NamedTuple):
@@ -76,7 +77,6 @@ class TrainingSamples(Dataset[Sample]):
         share: probability that a scene is drawn from ``more``, if it is not empty.
         shapes: views, image size and probability, ``((views, height, width, share), ...)``.
         any_views: share of the samples, except walks, whose views are drawn whether they overlap or not.
-        plain: whether colours, poses, sources and views stay as they are (validation).
     """
 
     def __init__(
@@ -87,9 +87,8 @@ class TrainingSamples(Dataset[Sample]):
         share: float = 0.25,
         shapes: Sequence[Sequence[float]] = ((4, 80, 160, 1.0),),
         any_views: float = 0.0,
-        plain: bool = False,
     ) -> None:
-        self.files, self.seed, self.plain = list(files), seed, plain
+        self.files, self.seed = list(files), seed
         self.more, self.share, self.any_views = list(more), share if more else 0.0, any_views
         self.shapes = [(int(views), (int(height), int(width))) for views, height, width, _ in shapes]
         shares = np.array([share for *_, share in shapes])
@@ -99,14 +98,15 @@ class TrainingSamples(Dataset[Sample]):
         rng = np.random.default_rng((self.seed, index))
         count, size = self.shapes[rng.choice(len(self.shapes), p=self.shares)]
         turns = draw_turns(rng)
-        while True:
+        for _ in range(_DRAWS):
             files = self.more if self.share and rng.random() < self.share else self.files
             path = files[rng.integers(len(files))]
             views = choose_views(read_scene(path), count, self.any_views, rng)
-            views = turn(crop(views, size, rng), 0 if self.plain else turns)
+            views = turn(crop(views, size, rng), turns)
             valid = views.depth[(views.depth > 0) & views.depth.isfinite()]
             if len(valid) >= _LEAST_PIXELS * views.depth.numel() / 51_200:
                 return self._finish(views, valid, rng)
+        raise ValueError(f"{_DRAWS} draws of {count} views, the last from {path}, have too few pixels with a depth")
 
     def _finish(self, views: Crop, valid: Tensor, rng: Generator) -> Sample:
         """Draws the unit of length, pose noise, sources, orphans and colours of a sample."""
@@ -118,17 +118,15 @@ class TrainingSamples(Dataset[Sample]):
         kinds = pixel_kinds(views.images, torch.where(depth.isfinite(), depth, 0.0), cameras)
         alone, bare = kinds["alone"].float(), kinds["bare"].float()
         shown = torch.ones(count, 1, size[0] // 8, size[1] // 8)
-        most, noise = min(COARSE_SOURCES, count - 1), None
-        images = views.images
-        if not self.plain:
-            low, middle = (float(unit * torch.quantile(valid[:: len(valid) // 4000 + 1], q)) for q in (0.01, 0.5))
-            poses = with_noise(poses, min(middle, 3 * low), rng)
-            if most > 1 and rng.random() < _FEWER_SHARE:
-                most = int(rng.integers(1 if rng.random() < 0.3 else 2, most + 1))
-            noise = torch.from_numpy(rng.normal(0, _SOURCE_NOISE, (count, count))).float()
-            if rng.random() < _ORPHAN_SHARE:
-                shown = _orphan(shown, rng)
-            images = recolour(images, rng)
+        most = min(COARSE_SOURCES, count - 1)
+        low, middle = (float(unit * torch.quantile(valid[:: len(valid) // 4000 + 1], q)) for q in (0.01, 0.5))
+        poses = with_noise(poses, min(middle, 3 * low), rng)
+        if most > 1 and rng.random() < _FEWER_SHARE:
+            most = int(rng.integers(1 if rng.random() < 0.3 else 2, most + 1))
+        noise = torch.from_numpy(rng.normal(0, _SOURCE_NOISE, (count, count))).float()
+        if rng.random() < _ORPHAN_SHARE:
+            shown = _orphan(shown, rng)
+        images = recolour(views.images, rng)
         sources = coarse_sources(poses, views.intrinsics, size, most, noise)
         hidden = 1 - shown[:, 0].repeat_interleave(8, 1).repeat_interleave(8, 2)
         weight = 1 + _ALONE * torch.maximum(alone, hidden) + _BARE * bare * (1 - hidden)
@@ -140,7 +138,7 @@ def choose_views(scene: SceneFrames, count: int, any_views: float, rng: Generato
     rotations = scene.world_to_camera[:, :3, :3]
     frames = len(scene.images)
     step = np.median([_angle(*pair) for pair in pairwise(rotations)])
-    if frames <= _WALK_FRAMES and step < _WALK_STEP:
+    if frames <= FRAMES and step < _WALK_STEP:
         field = 2 * math.atan(0.5 * scene.images.shape[2] / float(scene.intrinsics[0, 0, 0]))
         most = field * rng.uniform(0.3, 1.1)
         first = int(rng.integers(0, frames - count + 1))

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from safetensors import safe_open
+from safetensors.torch import save
 from torch.nn import functional as F
 
 from backends.sweep.backend import SweepBackend
@@ -17,7 +18,7 @@ from backends.sweep.network import SweepEncoding
 from backends.sweep.planes import Planes, baselines
 from backends.sweep.stage import Stage
 from recipes.infinigen.slim import VIEWS, choose, decode_depth, encode_depth, read_slim, write_slim
-from recipes.sweep.__main__ import STATE, WEIGHTS, Training
+from recipes.sweep.__main__ import STATE, WEIGHTS, Training, begun_with
 from recipes.sweep.objective import cell_inverse, objective, plane_entropy
 from recipes.sweep.samples import Sample, TrainingSamples
 from recipes.sweep.scenes import read_scene, scene_files
@@ -25,6 +26,7 @@ from tests.commands import ROOT
 from tests.data.sources import layout_infinigen
 from tests.data.sources.layouts import room
 from vg2gt.geometry.cameras import project, unproject
+from vg2gt.io.files import write_bytes
 from vg2gt.types import Cameras
 
 SHAPES = [(2, 48, 96, 0.5), (12, 32, 64, 0.5)]
@@ -84,8 +86,15 @@ def test_samples_depend_on_their_number_alone(scenes: list[Path]) -> None:
         assert sample.weight.min() >= 1
     orphaned = [sample for sample in drawn if not sample.shown.all()]
     assert 1 <= len(orphaned) <= 7
-    plain = TrainingSamples(scenes, 0, shapes=SHAPES, plain=True)
-    assert all(plain[n].shown.all() for n in range(6))
+
+
+def test_scenes_without_depth_are_an_error(tmp_path: Path) -> None:
+    (path,) = scene_files(tmp_path, 1, 5_000_000, (48, 96))
+    frames = read_scene(path)
+    empty = frames._replace(depth=torch.zeros_like(frames.depth))
+    np.savez(path, **{name: value.numpy() for name, value in empty._asdict().items()})
+    with pytest.raises(ValueError, match=rf"100 draws of 2 views, the last from .*{path.name}, have too few pixels"):
+        TrainingSamples([path], 0, shapes=[(2, 48, 96, 1)])[0]
 
 
 def test_views_that_do_not_overlap_can_be_drawn(tmp_path: Path) -> None:
@@ -273,6 +282,37 @@ def test_the_target_of_the_planes_is_in_the_row_that_holds_it(place: float) -> N
     assert float(plane_entropy(stage, torch.full_like(t, 0.5), torch.ones_like(t), rows=2).detach()) == 0
 
 
+def test_where_training_begins(tmp_path: Path) -> None:
+    """With a state in ``out``, else with ``begin``; a fall continues its own, and only if it began from that state."""
+
+    def config(**options: object) -> DictConfig:
+        return OmegaConf.create({"out": str(tmp_path / "out"), "begin": None, "cooldown": 0} | options)
+
+    def state(path: Path, step: int, fallen: int = 0) -> Path:
+        write_bytes(path, save({"x": torch.zeros(1)}, metadata={"step": str(step), "fallen": str(fallen)}))
+        return path
+
+    out, begin = tmp_path / "out", state(tmp_path / "begin.safetensors", 7)
+    cooled = out / "cooled"
+    assert begun_with(config()) == (out, None)
+    assert begun_with(config(begin=str(begin))) == (out, begin)
+    with pytest.raises(FileNotFoundError, match=r"begin=.*nowhere does not exist"):
+        begun_with(config(begin=str(tmp_path / "nowhere")))
+    with pytest.raises(FileNotFoundError, match=r"give a state from which the rate falls, begin=FILE"):
+        begun_with(config(cooldown=5))
+    assert begun_with(config(begin=str(begin), cooldown=5)) == (cooled, begin)
+    base = state(out / STATE, 9)
+    assert begun_with(config(begin=str(begin))) == (out, base)
+    assert begun_with(config(cooldown=5)) == (cooled, base)
+    state(cooled / STATE, 12, 3)
+    assert begun_with(config(cooldown=5)) == (cooled, cooled / STATE)
+    with pytest.raises(ValueError, match=r"holds a fall of 3 steps, which is over"):
+        begun_with(config(cooldown=3))
+    state(base, 20)
+    with pytest.raises(ValueError, match=r"holds a fall from step 9, not from .*: move it away"):
+        begun_with(config(cooldown=5))
+
+
 @pytest.mark.slow
 def test_a_fall_of_the_rate_that_was_stopped_continues(scenes: list[Path], tmp_path: Path) -> None:
     """Three steps, the first of them in a run that is stopped by its time; the state that it began with stays."""
@@ -291,4 +331,4 @@ def test_a_fall_of_the_rate_that_was_stopped_continues(scenes: list[Path], tmp_p
     assert (tmp_path / STATE).read_bytes() == kept
     SweepBackend(path=str(tmp_path / "cooled" / WEIGHTS))
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert "holds a fall of 3 steps, which is over: choose another out=" in done.stderr
+    assert "holds a fall of 3 steps, which is over: move it away" in done.stderr
