@@ -104,7 +104,8 @@ class Hints(TensorRecord):
         scene_key: one name per scene; seeds simulated noise.
         frame_ids: ``[B, V]`` int64 frame numbers; seed simulated noise.
         depth_range: ``[B, 2]`` z-depth (near, far) that contains nearly everything the views see, for example from
-            sparse structure-from-motion points, in the unit of the cameras' translations; None if unknown.
+            sparse structure-from-motion points, in the unit of the cameras' translations; None if unknown. The backends
+            in the package do not need it.
         mask: ``[B, V, H, W]`` in [0, 1], weight of each pixel (alpha, mask images); None: all 1.
     """
 

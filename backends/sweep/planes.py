@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from backends.sweep.views import camera_distances, choose_sources
+from backends.sweep.views import camera_distances, camera_extent, choose_sources
 
 COARSE_SOURCES, _FINE_SOURCES = 6, 3
 _NEAREST = 0.15  # depth of the nearest plane, in baselines
@@ -17,7 +17,7 @@ _SPAN = math.log1p(_BEND / _NEAREST)
 PLANES = 64  # of the first stage
 FARTHEST = 0.1 / (PLANES - 1)  # smallest position of a hypothesis: thousands of baselines away
 _SCORED = (0.7, 30.0)  # near and far, in baselines, of the points whose visibility scores the sources
-_LEAST_BASELINE = 0.02  # in units of the largest distance between cameras
+_LEAST_BASELINE = 0.02  # in extents of the cameras
 _ENOUGH_PARALLAX, _WIDE_PARALLAX = 0.06, 0.4  # baseline over depth: see fine_sources
 _SEEN_AGAIN = 0.6  # share of its weight that a pixel loses with every source that sees it
 
@@ -31,7 +31,7 @@ def baselines(world_to_camera: Tensor) -> Tensor:
         world_to_camera: ``[V, 4, 4]``, not all in one place.
     """
     distances = camera_distances(world_to_camera)
-    least = _LEAST_BASELINE * distances.max()
+    least = _LEAST_BASELINE * camera_extent(distances)
     others = distances.fill_diagonal_(torch.inf)
     count = min(COARSE_SOURCES, len(others) - 1)
     nearest = others.sort(1).values[:, :count].median(1).values

@@ -13,8 +13,8 @@ _GRID = (5, 9)  # rays per view for measuring overlap
 _DEPTHS = 5  # planes between near and far for measuring overlap
 # baseline over depth: too little parallax below the first, too different views above the second
 _LEAST_PARALLAX, _MOST_PARALLAX = 0.08, 0.5
-# cameras nearer than this, relative to the largest distance between cameras, count as in one place
-_ONE_PLACE = 0.01
+_ONE_PLACE = 0.015  # cameras nearer than this count as in one place, in extents (camera_extent)
+_ONE_CAMERA = 1e-3  # extent without the farthest camera, relative to that with it, below which the latter counts
 _SAME_DIRECTION = math.cos(math.radians(5))
 _SEEN_AGAIN = 0.4  # factor on a point's score for every source that already sees it
 
@@ -72,7 +72,7 @@ def choose_sources(
         reward = reward * torch.exp(noise)
     seen = inside.float()  # [V, s, z p]
     left = torch.ones_like(seen[:, 0])  # [V, z p] weights of the points for the next source
-    together = distances <= _ONE_PLACE * distances.max()
+    together = distances <= _ONE_PLACE * camera_extent(distances)
     together |= torch.eye(views, dtype=torch.bool, device=reward.device)
     cosine = (torch.einsum("vij,sij->vs", world_to_camera[:, :3, :3], world_to_camera[:, :3, :3]) - 1) / 2
     copies = together & (cosine > _SAME_DIRECTION)
@@ -118,3 +118,17 @@ def camera_distances(world_to_camera: Tensor) -> Tensor:
     """Returns the distances ``[V, V]`` between the centres of cameras ``[V, 4, 4]``."""
     centers = torch.linalg.inv(world_to_camera)[:, :3, 3]
     return torch.cdist(centers, centers, compute_mode="donot_use_mm_for_euclid_dist")  # mm loses small distances
+
+
+def camera_extent(distances: Tensor) -> Tensor:
+    """Returns how far the cameras are apart: to the farthest but one, in the median over the views.
+
+    One camera far from all others, such as one that was placed wrongly, does not count unless the rest is in one place.
+
+    Args:
+        distances: ``[V, V]`` between the cameras.
+    """
+    views = len(distances)
+    within = distances.sort(1).values[:, -2 if views > 3 else -1].median()
+    whole = distances.max()
+    return torch.where(within < _ONE_CAMERA * whole, whole, within)

@@ -135,9 +135,7 @@ def begun_with(config: DictConfig) -> tuple[Path, Path | None]:
         header = _header(out / STATE)
         fallen = int(header["fallen"])
         if fallen >= config.cooldown:
-            raise ValueError(
-                f"{out} holds a fall of {fallen} steps, which is over: move it away"
-            )
+            raise ValueError(f"{out} holds a fall of {fallen} steps, which is over: move it away")
         first = int(header["step"]) - fallen
         if known and int(_header(known).get("step", 0)) != first:
             raise ValueError(f"{out} holds a fall from step {first}, not from {known}: move it away")

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from backends.weights import load_strictly
 from examples.backends.itermvs import IterMVSBackend
-from examples.backends.itermvs.depth_range import agreed_range, wide_range
+from examples.backends.itermvs.depth_range import range_of, wide_range
 from examples.backends.itermvs.matching import GROUPS, Hypotheses, Projections, similarity, similarity_reference
 from examples.backends.itermvs.network import IterMVSNet
 from tests.commands import ROOT
@@ -164,7 +164,7 @@ def row_of_cameras(views: int, step: float = 0.2) -> Tensor:
 
 
 def test_ranges() -> None:
-    """Of the first search from the cameras, then from depths that views agree on."""
+    """Of the first search from the cameras, then from the depths that count."""
     poses = row_of_cameras(4)
     walk = row_of_cameras(21)  # 4 long: something may stand as near as a step
     ranges = torch.stack((wide_range(poses), wide_range(walk)))
@@ -173,7 +173,7 @@ def test_ranges() -> None:
     close[0, 0, 3] = 1.0  # and one camera far away
     torch.testing.assert_close(wide_range(close), torch.tensor([0.03, 40.0]), rtol=1e-3, atol=0)
     depth = torch.cat((torch.linspace(2, 4, 1000), torch.full((1000,), 90.0)))
-    agreeing = torch.cat((torch.ones(1000), torch.zeros(1000)))
-    found = agreed_range(depth, agreeing, wide_range(poses))
+    near = depth < 5
+    found = range_of(depth, near, wide_range(poses))
     torch.testing.assert_close(found, torch.tensor([2.02 * 0.8, 3.98 * 1.4]), rtol=1e-2, atol=0)
-    assert torch.equal(agreed_range(depth, 0 * agreeing, wide_range(poses)), wide_range(poses))
+    assert torch.equal(range_of(depth, near & ~near, wide_range(poses)), wide_range(poses))

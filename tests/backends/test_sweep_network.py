@@ -62,6 +62,7 @@ def test_planes_reach_from_infinity_to_a_fraction_of_the_baseline() -> None:
         ([0.0, 5, 10, 15], [10, 5, 5, 10]),
         ([0.0, 0, 0.1, 10, 15], [10, 10, 9.9, 9.9, 14.9]),  # the first three are nearly in one place
         ([0.0, 0, 4], [4, 4, 4]),
+        ([0.0, 1, 2, 3, 900], [2, 1, 1, 2, 898]),  # one is far away
     ],
 )
 def test_baselines_are_in_the_unit_of_the_cameras(places: list[float], expected: list[float]) -> None:

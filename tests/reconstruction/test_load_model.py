@@ -72,7 +72,6 @@ def test_what_ships_needs_no_name() -> None:
     loaded = load_model(device="cpu")
     assert (loaded.model.backend.name, loaded.weights.path) == ("sweep", SHIPPED)
     assert load_model(backend="sweep", device="cpu").weights.path == SHIPPED
-    assert load_model(None, "sweep", ["+backend.seed=1"], device="cpu").weights.path is None
 
 
 def test_views_check_the_depth_of_learned_backbones() -> None:

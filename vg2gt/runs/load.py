@@ -36,8 +36,6 @@ log = logging.getLogger(__name__)
 SHIPPED = Path(__file__).resolve().parents[1] / "weights" / "sweep-tiny.safetensors"
 """Head trained on ``backend=sweep``; the package also contains that backend's weights, so no download is needed."""
 PARTS = ("backend", "model", "renderer")
-_SAME_OUTPUT = ("path", "pretrained", "revision", "head_chunk", "views_per_chunk")
-"""Keys that do not change what a network computes, or whose effect is covered by the hash of the weights."""
 _TOKENS = ("taps", "reference_view", "given_poses")
 """Backend keys that change its outputs for the same weights; a trained part is valid for one choice only."""
 
@@ -90,8 +88,8 @@ def load_model(
 
     Args:
         ckpt: a checkpoint or a run's folder. None loads the weights that ship with the package (:data:`SHIPPED`), or
-            with another backend than ``sweep``, or ``backend=sweep`` with options that change what it computes, the
-            untrained head of ``model=tiny_ungated`` (``oracle``: ``tiny``), which predicts coloured voxels.
+            with another backend than ``sweep`` the untrained head of ``model=tiny_ungated`` (``oracle``: ``tiny``),
+            which predicts coloured voxels.
         backend: an option of ``backend=``, short for the override ``backend=NAME``; None keeps the run's backend.
         overrides: command-line overrides. ``backend=NAME``, ``model=NAME`` and ``renderer=NAME`` replace a part of the
             run's configuration; ``backend.key=value`` and the like change one key.
@@ -128,8 +126,7 @@ def _model_parts(ckpt: str | Path | None, overrides: Sequence[str]) -> tuple[Pat
         if "=" not in override or key.partition(".")[0] not in PARTS:
             raise ValueError(f"option {override!r}: expected key=value with a key of {', '.join(PARTS)}")
     named = {key for key in keys if "." not in key}
-    of_backend = [key.removeprefix("backend.") for key in keys if key.startswith("backend.")]
-    suits = "backend" not in named or ("backend=sweep" in overrides and all(key in _SAME_OUTPUT for key in of_backend))
+    suits = "backend" not in named or "backend=sweep" in overrides
     checkpoint = checkpoint_path(SHIPPED if ckpt is None and suits else ckpt)
     chosen = [override for override, key in zip(overrides, keys, strict=True) if key.partition(".")[0] in named]
     parts = resolve_parts(compose_groups(*chosen) if chosen else OmegaConf.create(), checkpoint)
@@ -146,6 +143,7 @@ def _model_parts(ckpt: str | Path | None, overrides: Sequence[str]) -> tuple[Pat
                 f"option {override!r}: {str(error).splitlines()[0]}; {part} has {', '.join(parts[part])}"
             ) from error
     parts = {part: config[part] for part in PARTS}
+    of_backend = any(key.startswith("backend.") for key in keys)
     if checkpoint is not None and "backend" not in named and of_backend:
         refuse_other_tokens(parts["backend"], read_checkpoint(checkpoint), checkpoint)
     return checkpoint, parts

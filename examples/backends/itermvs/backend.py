@@ -12,7 +12,7 @@ from torch.nn import functional as F
 from backends.base import Backend
 from backends.sweep.views import choose_sources
 from backends.weights import Weights
-from examples.backends.itermvs.depth_range import agreed_range, wide_range
+from examples.backends.itermvs.depth_range import range_of, wide_range
 from examples.backends.itermvs.matching import Projections
 from examples.backends.itermvs.network import HIDDEN, STRIDE, IterMVSNet
 from vg2gt.geometry.cameras import resize_intrinsics
@@ -92,7 +92,7 @@ class IterMVSBackend(Backend):
         small = F.avg_pool2d(F.pad(images, (0, images.shape[-1] % 16, 0, images.shape[-2] % 16), mode="replicate"), 2)
         half = replace(cameras, intrinsics=resize_intrinsics(cameras.intrinsics, 0.5, 0.5))
         depth, confidence = self.network.decode(*self._match(small, half, wide), wide)
-        return agreed_range(depth, (confidence > _CONFIDENT).float(), wide)
+        return range_of(depth, confidence > _CONFIDENT, wide)
 
     def _match(self, images: Tensor, cameras: Cameras, depth_range: Tensor) -> tuple[Tensor, Tensor]:
         """Returns hidden states ``[V, HIDDEN, h, w]`` and features for the upsampling ``[V, 32, h, w]``."""

@@ -1,4 +1,4 @@
-"""Depth ranges: from the cameras alone, and from the depths that a first search finds."""
+"""Depth ranges: from the cameras alone, and from the depths of a first search."""
 
 from __future__ import annotations
 
@@ -24,18 +24,16 @@ def wide_range(world_to_camera: Tensor) -> Tensor:
     return torch.stack((near, _WIDE[1] * extent))
 
 
-def agreed_range(depth: Tensor, agreement: Tensor, fallback: Tensor) -> Tensor:
-    """Returns near and far ``[2]`` around the depths whose agreement is above one half.
-
-    Pixels are selected by agreement, not confidence, which is biased towards near, well textured surfaces.
+def range_of(depth: Tensor, chosen: Tensor, fallback: Tensor) -> Tensor:
+    """Returns near and far ``[2]`` around the depths of some pixels.
 
     Args:
         depth: depth of the pixels, of any shape.
-        agreement: their agreement with the sources in [0, 1], of the same shape.
-        fallback: range ``[2]`` to return if less than 1 % of the pixels agree.
+        chosen: which of them count, of the same shape.
+        fallback: range ``[2]`` to return if these are less than 1 % of the pixels.
     """
-    agreed = depth[agreement > 0.5].sort().values
-    if len(agreed) < 0.01 * depth.numel():
+    counted = depth[chosen].sort().values
+    if len(counted) < 0.01 * depth.numel():
         return fallback
-    low, high = agreed[int(0.01 * len(agreed))], agreed[int(0.99 * len(agreed))]
+    low, high = counted[int(0.01 * len(counted))], counted[int(0.99 * len(counted))]
     return torch.stack((low * 0.8, high * 1.4))
