@@ -33,15 +33,15 @@ from vg2gt.types import Batch, Geometry, Hints
 
 Depth: TypeAlias = Callable[[Batch], Geometry]
 
-MADE = " data.eval_scenes={scenes} data.image_size=[112,224]"
+MADE = " data.eval_scenes={scenes} data.image_size={size}"
 WORLDS = f"hydra.searchpath=[{Path(__file__).parents[1] / 'examples/worlds/configs'}] data=worlds" + MADE
 SETS = {
     "rooms": "data=synthetic" + MADE,
     "outdoors": WORLDS + " data.variant=outdoor",
     "objects": WORLDS + " data.variant=object",
     "wide rooms": WORLDS + " data.variant=wide",
-    "HoloLens office": "data=rgbd data.root={shared}/hololens_office_a data.image_size=[112,224]",
-    "7-Scenes kitchen": "data=rgbd data.root={shared}/seven_scenes_redkitchen_a_registered data.image_size=[112,224]"
+    "HoloLens office": "data=rgbd data.root={shared}/hololens_office_a data.image_size={size}",
+    "7-Scenes kitchen": "data=rgbd data.root={shared}/seven_scenes_redkitchen_a_registered data.image_size={size}"
     " data.eval_window=10",
     "Infinigen rooms": "data=infinigen data.root={infinigen} data.image_size=[112,224] data.eval_window=10",
 }
@@ -113,6 +113,7 @@ def main() -> None:
     arguments.add_argument("--infinigen", type=Path, help="folder with rooms made by recipes/infinigen")
     arguments.add_argument("--weights", help="safetensors file instead of the shipped weights")
     arguments.add_argument("--scenes", type=int, default=16, help="number of procedural scenes of a kind")
+    arguments.add_argument("--size", default="[160,288]", help="[height,width] of all but Infinigen's views")
     arguments.add_argument("--itermvs", type=Path, help="checkout of FangjinhuaWang/IterMVS: measures it as well")
     arguments.add_argument("--ckpt", help="run: measures its backbone, and the depth after its coarse module, as well")
     options = arguments.parse_args()
@@ -142,7 +143,7 @@ def main() -> None:
         kinds = (f"{kind} {figures[f'share {kind}']:.0%} {figures[f'abs_rel {kind}']:.3f}" for kind in KINDS)
         print(" " * 18, ", ".join(kinds), flush=True)
     weights = {suffix.strip(", ") or "sweep": network.identity()["weights"] for suffix, network in backends.items()}
-    content = {"machine": machine(), "version": __version__, "weights": weights, "sets": sets}
+    content = {"machine": machine(), "version": __version__, "size": options.size, "weights": weights, "sets": sets}
     write_results(options.out, "plane_sweep", content)
 
 

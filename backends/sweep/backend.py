@@ -11,7 +11,7 @@ from torch import Tensor
 
 from backends.base import Backend
 from backends.sweep.network import PosedViews, SweepNet
-from backends.sweep.planes import coarse_sources
+from backends.sweep.planes import sources_of
 from backends.sweep.tokens import DIM, PATCH, TAPS
 from backends.weights import Weights
 from vg2gt.geometry.precision import full_precision
@@ -61,7 +61,7 @@ class SweepBackend(Backend):
         with full_precision(images):
             for scene, pictures in enumerate(images.float()):
                 views = PosedViews(pictures, cameras.world_to_camera[scene], cameras.intrinsics[scene])
-                sources = coarse_sources(views.world_to_camera, views.intrinsics, views.size)
+                sources = sources_of(views.world_to_camera, views.intrinsics, views.size)
                 encoded.append(self.network.encode(self.network.features(views.images), views, sources))
         taps = [torch.stack([each.taps[tap] for each in encoded]) for tap in range(TAPS)]
         state = {name: torch.stack([getattr(each, name) for each in encoded]) for name in _STATE}

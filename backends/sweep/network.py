@@ -11,11 +11,10 @@ from torch.nn import functional as F
 
 from backends.sweep.correlate import SourceWarp
 from backends.sweep.features import CONTEXT_COARSE, FeaturePyramid, Features
-from backends.sweep.planes import FARTHEST, PLANES, Planes, baselines, fine_sources
+from backends.sweep.planes import FARTHEST, PLANES, Planes, baselines
 from backends.sweep.refine import CELLS, DepthHead, PlainBlock, RefineNet, activate, convex_upsample, slices
 from backends.sweep.stage import Matching, Stage
 from backends.sweep.tokens import DIM, PATCH, POSITION_CHANNELS, TAPS, TokenBlock, attend, patch_places
-from backends.sweep.views import relative_poses
 from backends.sweep.volume import agreement
 from vg2gt.geometry.cameras import resize_intrinsics
 
@@ -115,7 +114,7 @@ class SweepNet(nn.Module):
         Args:
             features: features of ``views.images``.
             views: the views.
-            sources: indices of the sources of each view at 1/8 ``[V, n]``.
+            sources: indices of the sources of each view ``[V, n]``.
             shown: 0 where a view is matched with no source (training), else 1, ``[V, 1, H / 8, W / 8]``.
         """
         unit = baselines(views.world_to_camera)
@@ -153,22 +152,17 @@ class SweepNet(nn.Module):
         tokens = attend(self.blocks[:2], tokens, place, grid)[-1]
         filled = F.pad(self.fill(tokens).mT.unflatten(-1, grid), (0, 0, 0, 0, 1, 0))
         center, guess, share = blend(change + filled)
-        # twice more, around that, with the best sources
-        parallax = relative_poses(views.world_to_camera, sources)[..., :3, 3].norm(dim=-1)  # [V, n]
-        parallax = parallax[..., None] * (-center.detach()).exp().flatten(1)[:, None]
-        chosen = fine_sources(visible.detach().flatten(2), parallax)
-        best = sources.gather(1, chosen)
-        visible = visible.detach().gather(1, chosen[:, :, None, None].expand(-1, -1, *visible.shape[2:]))
+        # twice more, around that
         quarter = convex_upsample(center, mask)
-        warp = views.warp(features.match[1], best, 4)
-        second, visible = self._quarter(quarter, first, share, features, planes, warp, visible)
+        warp = views.warp(features.match[1], sources, 4)
+        second, visible = self._quarter(quarter, first, share, features, planes, warp, visible.detach())
         log_depth = -planes.inverse(second.t).log()
         agreeing = agreement((-log_depth).exp().detach(), warp, _AGREEMENT[1])
         known = torch.cat((log_depth - scale, second.mass, agreeing, log_depth - quarter), 1)
         found = self.begin(torch.cat((features.context, known), 1))
         found = self.end(activate(self.block(found)))
         half = convex_upsample(log_depth + 0.1 * found[:, :1], found[:, 1:])
-        third, _ = self._narrow(2, half, _HALF, features, planes, views.warp(features.match[2], best, 2), visible)
+        third, _ = self._narrow(2, half, _HALF, features, planes, views.warp(features.match[2], sources, 2), visible)
         log_depth = -planes.inverse(third.t).log()
         fine = F.pixel_unshuffle(torch.cat((log_depth - scale, third.mass), 1), 4)
         tokens = tokens + self.embed_fine(torch.cat((F.pixel_unshuffle(known, 2), fine), 1).flatten(2).mT)
@@ -208,7 +202,7 @@ class SweepNet(nn.Module):
             share: share of the matched depth in ``center``, ``[V, 1, h / 2, w / 2]``.
             features: features of all views.
             planes: unit of their planes.
-            warp: correspondences with the best sources.
+            warp: correspondences with the sources.
             visible: visibility of the pixels in them ``[V, n, h / 2, w / 2]``.
 
         Returns:

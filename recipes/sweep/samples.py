@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn import functional as F
 from torch.utils.data import Dataset
 
-from backends.sweep.planes import COARSE_SOURCES, coarse_sources
+from backends.sweep.planes import SOURCES, sources_of
 from recipes.sweep.scenes import FRAMES, SceneFrames, read_scene
 from vg2gt.geometry.cameras import crop_intrinsics, project, resize_intrinsics, rigid_motions, unproject
 from vg2gt.metrics.kinds import pixel_kinds
@@ -118,7 +118,7 @@ class TrainingSamples(Dataset[Sample]):
         kinds = pixel_kinds(views.images, torch.where(depth.isfinite(), depth, 0.0), cameras)
         alone, bare = kinds["alone"].float(), kinds["bare"].float()
         shown = torch.ones(count, 1, size[0] // 8, size[1] // 8)
-        most = min(COARSE_SOURCES, count - 1)
+        most = min(SOURCES, count - 1)
         low, middle = (float(unit * torch.quantile(valid[:: len(valid) // 4000 + 1], q)) for q in (0.01, 0.5))
         poses = with_noise(poses, min(middle, 3 * low), rng)
         if most > 1 and rng.random() < _FEWER_SHARE:
@@ -127,7 +127,7 @@ class TrainingSamples(Dataset[Sample]):
         if rng.random() < _ORPHAN_SHARE:
             shown = _orphan(shown, rng)
         images = recolour(views.images, rng)
-        sources = coarse_sources(poses, views.intrinsics, size, most, noise)
+        sources = sources_of(poses, views.intrinsics, size, most, noise)
         hidden = 1 - shown[:, 0].repeat_interleave(8, 1).repeat_interleave(8, 2)
         weight = 1 + _ALONE * torch.maximum(alone, hidden) + _BARE * bare * (1 - hidden)
         return Sample(images, depth, poses, views.intrinsics, sources, shown, weight)

@@ -10,7 +10,7 @@ from torch.nn import functional as F
 from backends.sweep import SweepBackend
 from backends.sweep.correlate import SourceWarp
 from backends.sweep.network import PosedViews, SweepEncoding, SweepNet
-from backends.sweep.planes import FARTHEST, PLANES, Planes, baselines, coarse_sources, fine_sources
+from backends.sweep.planes import FARTHEST, PLANES, Planes, baselines, sources_of
 from backends.sweep.refine import RESPONSE
 from backends.sweep.stage import Matching
 from vg2gt.data import SyntheticScenes
@@ -38,7 +38,7 @@ def posed(make_scene, views: int = 4, scene: int = 0) -> PosedViews:
 
 
 def encode(net: SweepNet, views: PosedViews, shown: Tensor | None = None, count: int = 6) -> SweepEncoding:
-    sources = coarse_sources(views.world_to_camera, views.intrinsics, views.size, count)
+    sources = sources_of(views.world_to_camera, views.intrinsics, views.size, count)
     return net.encode(net.features(views.images), views, sources, shown)
 
 
@@ -80,7 +80,7 @@ def test_views_from_one_place_are_no_sources_of_each_other(make_scene) -> None:
             poses[2] = (
                 torch.linalg.matrix_exp(torch.tensor([[0, 0, 0.17, 0], [0] * 4, [-0.17, 0, 0, 0], [0] * 4])) @ poses[2]
             )
-        found = coarse_sources(poses, views.intrinsics, views.size)
+        found = sources_of(poses, views.intrinsics, views.size)
         assert found.shape == (5, 4)
         of_copies = {0, 2} if turned else {0}
         for view, others in enumerate(({3, 4}, {3, 4}, {3, 4}, of_copies | {4}, of_copies | {3})):
@@ -107,15 +107,6 @@ def test_images_of_a_single_patch(make_scene, size: tuple[int, int]) -> None:
     depth = backend.decode(backend.encode(images, Hints(cameras=hints.cameras))).depth
     assert depth.shape == (1, 3, *size)
     assert depth.isfinite().all()
-
-
-def test_sources_that_see_something_else_are_taken() -> None:
-    """The second source is the one that sees what the first does not, although it sees less; none without parallax."""
-    visible = torch.tensor([[0.9] * 6 + [0.1] * 4, [0.8] * 6 + [0.1] * 4, [0.1] * 7 + [0.9] * 3, [1.0] * 10])[None]
-    parallax = torch.full_like(visible, 0.15)
-    parallax[:, 3] = 0.001
-    assert fine_sources(visible, parallax, 2).tolist() == [[0, 2]]
-    assert fine_sources(visible[:, :2], parallax[:, :2], 3).shape == (1, 2)
 
 
 @pytest.mark.parametrize("estimated", [True, False])
