@@ -7,6 +7,7 @@ import shutil
 import sys
 from contextlib import redirect_stdout, suppress
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -142,6 +143,14 @@ def test_options_of_groups_exist(page: Path) -> None:
         for option in re.findall(rf"(?<![\w.=+/-]){group}=([a-z]\w*)(?![\w.*/])", text):
             found = option in group_options(group) or (group, option) in examples
             assert found or option == "null", f"{named(page)}: {group}={option}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=named)
+def test_rows_of_tables_have_as_many_cells_as_their_header(page: Path) -> None:
+    lines = without_code(page.read_text(encoding="utf-8")).splitlines()
+    for before, line in pairwise(lines):
+        if before.startswith("|") and line.startswith("|"):
+            assert line.count("|") == before.count("|"), line
 
 
 def test_code_names_pages_that_exist() -> None:
