@@ -69,7 +69,7 @@ class ViewCheck:
     rounds: int = 2
     partners: int = 24
     fine_below: float = 1.4
-    coarsest: float = 1.4  # 2 gives a third fewer Gaussians, and up to 0.9 dB less on photographs (recipes/sweep/README.md)
+    coarsest: float = 1.4  # 2: a third fewer Gaussians, up to 0.9 dB less on photographs (recipes/sweep/README.md)
     moment: int | None = None
     moved_margin: float = 0.08
 
