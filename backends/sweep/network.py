@@ -20,8 +20,12 @@ from vg2gt.geometry.cameras import resize_intrinsics
 
 _SPACING = 1 / (PLANES - 1)
 _QUARTER, _HALF = (16, 0.25 * _SPACING), (8, 0.1 * _SPACING)  # planes of a row, and spacing, of the later stages
-ROWS = (1, 2, 1)  # rows of planes of the stages
+ROWS = (1, 3, 1)  # rows of planes of the stages
 _OTHER = 3 * _SPACING  # distance from a centre from which on a plane of the first stage counts as another answer
+# The nearest depth of so many cells at 1/4 is tried as well, with this on its logits (chosen: 2 of 0 to 3). It was not
+# part of training. Thin things in front are found: outdoor scenes lose 13 % of their error, rooms 3 %.
+_AROUND, _NEARER = 9, 2.0
+_NEVER = -30.0  # on the logits of a row that repeats the first
 _CHANNELS = (16, 16, 8)  # of the regularisation of each stage
 _AGREEMENT = (0.1, 0.05)  # widths of the agreement at 1/8 and 1/4
 _FARTHEST_MATCHED, _BEYOND = 0.95, 1.5  # quantile of the matched depth of a scene, and the greatest depth over it
@@ -192,9 +196,11 @@ class SweepNet(nn.Module):
         warp: SourceWarp,
         visible: Tensor,
     ) -> tuple[Stage, Tensor]:
-        """The stage at 1/4, on two rows of planes: around ``center``, and around the likeliest plane not near it.
+        """The stage at 1/4, on three rows of planes.
 
-        At 1/8 a thin object shares its cell with what is behind it, and a wrong guess may replace a right match.
+        They lie around ``center``, around the likeliest plane not near it, and around the nearest depth of the
+        surroundings. At 1/8 a thin object shares its cell with what is behind it, and a wrong guess may replace a right
+        match.
 
         Args:
             center: log-depth ``[V, 1, h, w]``.
@@ -206,24 +212,37 @@ class SweepNet(nn.Module):
             visible: visibility of the pixels in them ``[V, n, h / 2, w / 2]``.
 
         Returns:
-            The stage, with the planes of both rows, and the visibility ``[V, n, h, w]``.
+            The stage, with the planes of all rows, and the visibility ``[V, n, h, w]``.
         """
         likely = F.interpolate(first.logits.detach().softmax(1), size=center.shape[-2:], mode="nearest")
-        near = (first.position - planes.position(center.detach())).abs() <= _OTHER  # [V, PLANES, h, w]
-        best, index = likely.masked_fill(near, 0).max(1, keepdim=True)
-        other = -planes.inverse(index / (PLANES - 1)).log()
         share = F.interpolate(share.detach(), size=center.shape[-2:], mode="nearest")
-        known = torch.cat((best, (likely * near).sum(1, keepdim=True), share), 1)
-        bias = self.other(known.movedim(1, -1)).movedim(-1, 1)  # [V, 1, h, w]
-        one, kept = self._narrow(1, center, _QUARTER, features, planes, warp, visible)
-        two, _ = self._narrow(1, other, _QUARTER, features, planes, warp, visible)
-        logits = torch.cat((one.logits, two.logits + bias), 1)
-        # the depth is that of the row with the likelier peak, so that the two are never averaged
-        is_other = two.logits.amax(1, keepdim=True) + bias > one.logits.amax(1, keepdim=True)
-        shares = logits.unflatten(1, (2, -1)).logsumexp(2).softmax(1)  # [V, 2, h, w]
-        mass = torch.where(is_other, two.mass * shares[:, 1:], one.mass * shares[:, :1])
-        position = torch.cat((one.position, two.position), 1)
-        return Stage(logits, position, torch.where(is_other, two.t, one.t), mass), kept
+        position = planes.position(center.detach())
+        near = (first.position - position).abs() <= _OTHER  # [V, PLANES, h, w]
+        held = (likely * near).sum(1, keepdim=True)
+
+        def bias(probability: Tensor) -> Tensor:
+            return self.other(torch.cat((probability, held, share), 1).movedim(1, -1)).movedim(-1, 1)  # [V, 1, h, w]
+
+        best, index = likely.masked_fill(near, 0).max(1, keepdim=True)
+        nearest = F.max_pool2d(position, _AROUND, 1, _AROUND // 2)
+        is_nearer = nearest - position > _OTHER
+        nearest = torch.where(is_nearer, nearest, position)
+        plane = (nearest / _SPACING).round().long().clamp(1, PLANES - 2)
+        found = sum(likely.gather(1, plane + offset) for offset in (-1, 0, 1))
+        of_nearest = torch.where(is_nearer, bias(found) + _NEARER, _NEVER)
+        biases = torch.cat((torch.zeros_like(best), bias(best), of_nearest), 1)
+        rows = [
+            self._narrow(1, row, _QUARTER, features, planes, warp, visible)
+            for row in (center, -planes.inverse(index * _SPACING).log(), -planes.inverse(nearest).log())
+        ]
+        logits = torch.stack([stage.logits for stage, _ in rows], 1) + biases[:, :, None]  # [V, 3, D, h, w]
+        # the depth is that of the row with the likeliest peak, so that rows are never averaged
+        chosen = logits.amax(2).argmax(1, keepdim=True)  # [V, 1, h, w]
+        shares = logits.logsumexp(2).softmax(1)
+        mass = torch.cat([stage.mass for stage, _ in rows], 1) * shares
+        t = torch.cat([stage.t for stage, _ in rows], 1)
+        places = torch.cat([stage.position for stage, _ in rows], 1)
+        return Stage(logits.flatten(1, 2), places, t.gather(1, chosen), mass.gather(1, chosen)), rows[0][1]
 
     def _narrow(
         self,

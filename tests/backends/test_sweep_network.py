@@ -138,7 +138,7 @@ def test_shapes_and_gradients(make_scene, network: SweepNet) -> None:
         encoding.taps, encoding.context, encoding.context_fine, encoding.swept, encoding.origin
     )
     assert depth.shape == log_scale.shape == (2, *SIZE)
-    assert [stage.logits.shape[1:] for stage in encoding.stages] == [(64, 4, 6), (32, 8, 12), (8, 16, 24)]
+    assert [stage.logits.shape[1:] for stage in encoding.stages] == [(64, 4, 6), (48, 8, 12), (8, 16, 24)]
     parts = [depth.log(), log_scale, encoding.guess, *encoding.centers, *(stage.t for stage in encoding.stages)]
     torch.stack([part.square().mean() for part in parts]).sum().backward()
     for name, parameter in network.named_parameters():
@@ -205,19 +205,26 @@ def test_nothing_is_much_farther_than_what_matches(make_scene, network: SweepNet
     assert encode(network.train(), views).centers[0].max() > 10
 
 
-def test_a_second_answer_is_searched_at_a_quarter(make_scene, network: SweepNet) -> None:
-    """The second row of planes lies around the likeliest plane of the first stage that the first row leaves out."""
+def test_other_answers_are_searched_at_a_quarter(make_scene, network: SweepNet) -> None:
+    """Rows of planes: around the centre, the likeliest plane that this leaves out, and the nearest depth around it."""
+    views = posed(make_scene, 3)
     with torch.no_grad():
-        encoding = encode(network, posed(make_scene, 3))
+        encoding = encode(network, views)
     first, second, _ = encoding.stages
     spacing = 1 / (PLANES - 1)
     # centres of the rows, from their last planes: the first ones may be cut at infinity
-    rows = second.position.unflatten(1, (2, 16))[:, :, -1] - 15 / 2 * 0.25 * spacing  # [V, 2, h, w]
+    rows = second.position.unflatten(1, (3, 16))[:, :, -1] - 15 / 2 * 0.25 * spacing  # [V, 3, h, w]
     assert ((rows[:, 1] - rows[:, 0]).abs() > 2 * spacing).all()
     likely = F.interpolate(first.logits.softmax(1), size=rows.shape[-2:], mode="nearest")
     left = likely.masked_fill((first.position - rows[:, :1]).abs() <= 3 * spacing, 0)
     torch.testing.assert_close(
         rows[:, 1], (left.argmax(1) * spacing).clamp_min(0.1 * spacing), rtol=0, atol=0.05 * spacing
     )
+    nearest = F.max_pool2d(rows[:, :1], 9, 1, 4)[:, 0]
+    nearer = nearest - rows[:, 0] > 3 * spacing
+    assert 0 < nearer.float().mean() < 1
+    torch.testing.assert_close(rows[:, 2], torch.where(nearer, nearest, rows[:, 0]), rtol=0, atol=0.05 * spacing)
+    mass = second.logits.softmax(1).unflatten(1, (3, 16))[:, 2].sum(1)
+    assert (mass[~nearer] < 1e-6).all()  # a row that repeats the first takes nothing from it
     inside = (second.t - rows).abs().amin(1) <= 2 * spacing  # the depth is in one of the rows, not between them
     assert inside.all()
