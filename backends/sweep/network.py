@@ -228,7 +228,7 @@ class SweepNet(nn.Module):
         is_nearer = nearest - position > _OTHER
         nearest = torch.where(is_nearer, nearest, position)
         plane = (nearest / _SPACING).round().long().clamp(1, PLANES - 2)
-        found = sum(likely.gather(1, plane + offset) for offset in (-1, 0, 1))
+        found = torch.stack([likely.gather(1, plane + offset) for offset in (-1, 0, 1)]).sum(0)
         of_nearest = torch.where(is_nearer, bias(found) + _NEARER, _NEVER)
         biases = torch.cat((torch.zeros_like(best), bias(best), of_nearest), 1)
         rows = [
