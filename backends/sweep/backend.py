@@ -11,8 +11,8 @@ from torch import Tensor
 
 from backends.base import Backend
 from backends.sweep.network import PosedViews, SweepNet
-from backends.sweep.planes import sources_of
 from backends.sweep.tokens import DIM, PATCH, TAPS
+from backends.sweep.views import sources_of
 from backends.weights import Weights
 from vg2gt.geometry.precision import full_precision
 from vg2gt.types import Geometry, Hints, Tokens

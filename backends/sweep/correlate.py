@@ -146,30 +146,36 @@ def sample_at(at_infinity, parallax, p, inverse, height, width):
     return (y, min(y + 1, height - 1)), (x, min(x + 1, width - 1)), weights, inside
 
 
+@kernel(fastmath=True, error_model="numpy", nogil=True, inline="always")
+def similarity_at(here, there, corners, weights, out):
+    """Writes the similarity per group of a pixel's features with those between four pixels of a source."""
+    (y, y1), (x, x1) = corners
+    w00, w01, w10, w11 = weights
+    f00, f01, f10, f11 = there[y, x], there[y, x1], there[y1, x], there[y1, x1]
+    for c in range(0, here.shape[0], GROUPS):
+        for g in range(GROUPS):
+            k = c + g
+            out[g] += here[k] * (w00 * f00[k] + w01 * f01[k] + w10 * f10[k] + w11 * f11[k])
+
+
 @kernel(fastmath=True, error_model="numpy", nogil=True)
 def _forward(geometry, first, similarity, inside):
     maps, sources, at_infinity, parallax, inverse = geometry
-    _, height, width, channels = maps.shape
+    height, width = maps.shape[1:3]
     for view in range(sources.shape[0]):
         for n in range(sources.shape[1]):
             other = sources[view, n]
             for d in range(inverse.shape[1]):
                 for p in range(height * width):
-                    (y, y1), (x, x1), (w00, w01, w10, w11), within = sample_at(
+                    rows, columns, weights, within = sample_at(
                         at_infinity[view, n], parallax[view, n], p, inverse[view, d, p], height, width
                     )
                     inside[view, n, d, p] = within
                     out = similarity[view, n, d, p]
                     out[:] = 0.0
-                    if not within:
-                        continue
-                    here = maps[first + view, p // width, p % width]
-                    f00, f01 = maps[other, y, x], maps[other, y, x1]
-                    f10, f11 = maps[other, y1, x], maps[other, y1, x1]
-                    for c in range(0, channels, GROUPS):
-                        for g in range(GROUPS):
-                            k = c + g
-                            out[g] += here[k] * (w00 * f00[k] + w01 * f01[k] + w10 * f10[k] + w11 * f11[k])
+                    if within:
+                        here = maps[first + view, p // width, p % width]
+                        similarity_at(here, maps[other], (rows, columns), weights, out)
 
 
 @kernel(fastmath=True, error_model="numpy", nogil=True)

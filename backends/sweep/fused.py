@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from backends.sweep.correlate import GROUPS, SourceWarp, sample_at
+from backends.sweep.correlate import GROUPS, SourceWarp, sample_at, similarity_at
 from vg2gt.kernels.compiled import kernel
 
 HIDDEN = 16  # channels between the two convolutions that weigh a similarity
@@ -53,7 +53,7 @@ def fused_volume(
 def _fused(geometry, network, first, estimate, volume, seen):
     maps, sources, at_infinity, parallax, inverse = geometry
     weight1, bias1, weight2, bias2, weight3, bias3 = network
-    _, height, width, channels = maps.shape
+    height, width = maps.shape[1:3]
     count, planes = sources.shape[1], inverse.shape[1]
     one = np.float32(1.0)
     similarity = np.empty((count, planes, GROUPS), np.float32)
@@ -66,19 +66,14 @@ def _fused(geometry, network, first, estimate, volume, seen):
             for n in range(count):
                 other = sources[view, n]
                 for d in range(planes):
-                    (y, y1), (x, x1), (w00, w01, w10, w11), inside = sample_at(
+                    rows, columns, weights, inside = sample_at(
                         at_infinity[view, n], parallax[view, n], p, inverse[view, d, p], height, width
                     )
                     out = similarity[n, d]
                     out[:] = 0.0
                     within[n, d] = one if inside else np.float32(0.0)
                     if inside:
-                        f00, f01 = maps[other, y, x], maps[other, y, x1]
-                        f10, f11 = maps[other, y1, x], maps[other, y1, x1]
-                        for c in range(0, channels, GROUPS):
-                            for g in range(GROUPS):
-                                k = c + g
-                                out[g] += here[k] * (w00 * f00[k] + w01 * f01[k] + w10 * f10[k] + w11 * f11[k])
+                        similarity_at(here, maps[other], (rows, columns), weights, out)
                     for k in range(HIDDEN):
                         hidden[k] = bias1[k]
                     for g in range(GROUPS):

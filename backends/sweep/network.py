@@ -11,10 +11,11 @@ from torch.nn import functional as F
 
 from backends.sweep.correlate import SourceWarp
 from backends.sweep.features import CONTEXT_COARSE, FeaturePyramid, Features
-from backends.sweep.planes import FARTHEST, PLANES, Planes, baselines
+from backends.sweep.planes import FARTHEST, PLANES, Planes
 from backends.sweep.refine import CELLS, DepthHead, PlainBlock, RefineNet, activate, convex_upsample, slices
 from backends.sweep.stage import Matching, Stage
 from backends.sweep.tokens import DIM, PATCH, POSITION_CHANNELS, TAPS, TokenBlock, attend, patch_places
+from backends.sweep.views import baselines
 from backends.sweep.volume import agreement
 from vg2gt.geometry.cameras import resize_intrinsics
 

@@ -7,8 +7,9 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from backends.sweep.network import ROWS, SweepEncoding
-from backends.sweep.planes import PLANES, Planes, baselines
+from backends.sweep.planes import PLANES, Planes
 from backends.sweep.stage import Stage
+from backends.sweep.views import baselines
 from recipes.sweep.samples import Sample
 
 _CLAMP, _SLOPE = 2.0, 0.2  # log-depth errors above this count by the slope only

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn import functional as F
 from torch.utils.data import Dataset
 
-from backends.sweep.planes import SOURCES, sources_of
+from backends.sweep.views import SOURCES, sources_of
 from recipes.sweep.scenes import FRAMES, SceneFrames, read_scene
 from vg2gt.geometry.cameras import crop_intrinsics, project, resize_intrinsics, rigid_motions, unproject
 from vg2gt.metrics.kinds import pixel_kinds

@@ -10,9 +10,10 @@ from torch.nn import functional as F
 from backends.sweep import SweepBackend
 from backends.sweep.correlate import SourceWarp
 from backends.sweep.network import PosedViews, SweepEncoding, SweepNet
-from backends.sweep.planes import FARTHEST, PLANES, Planes, baselines, sources_of
+from backends.sweep.planes import FARTHEST, PLANES, Planes
 from backends.sweep.refine import RESPONSE
 from backends.sweep.stage import Matching
+from backends.sweep.views import baselines, sources_of
 from vg2gt.data import SyntheticScenes
 from vg2gt.geometry.cameras import resize_intrinsics
 from vg2gt.types import Cameras, Hints

@@ -15,8 +15,9 @@ from torch.nn import functional as F
 
 from backends.sweep.backend import SweepBackend
 from backends.sweep.network import SweepEncoding
-from backends.sweep.planes import Planes, baselines
+from backends.sweep.planes import Planes
 from backends.sweep.stage import Stage
+from backends.sweep.views import baselines
 from recipes.infinigen.slim import VIEWS, choose, decode_depth, encode_depth, read_slim, write_slim
 from recipes.sweep.__main__ import STATE, WEIGHTS, Training, begun_with
 from recipes.sweep.objective import cell_inverse, objective, plane_entropy
