@@ -19,6 +19,8 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
+import vg2gt
+
 WAITING = {
     "_local_scalar_dense": 1,  # item, bool, int, float
     "nonzero": 1,
@@ -28,7 +30,7 @@ WAITING = {
     "unique_dim": 1,
     "bincount": 2,  # minimum and maximum
 }
-PACKAGE = "vg2gt"
+PACKAGE = Path(vg2gt.__file__).parent
 # What differs from one kernel per operation: nothing runs, or a fill and a copy.
 KERNELS = {
     **dict.fromkeys(("empty", "empty_like", "empty_strided", "new_empty", "new_empty_strided"), 0),
@@ -92,11 +94,10 @@ def _waits(name: str, args: Any, kwargs: Any) -> int:
 def place(frame: FrameType | None) -> str:
     """The innermost function of the package in the call stack of a frame."""
     while frame is not None:
-        parts = Path(frame.f_code.co_filename).parts
-        if PACKAGE in parts:
-            within = len(parts) - parts[::-1].index(PACKAGE)
+        file = Path(frame.f_code.co_filename)
+        if file.is_relative_to(PACKAGE):  # not by name: an environment may lie in a checkout that is called so
             name = getattr(frame.f_code, "co_qualname", frame.f_code.co_name)  # Python 3.10 has no co_qualname
-            return f"{'/'.join(parts[within:])} {name.replace('.<locals>', '')}"
+            return f"{file.relative_to(PACKAGE).as_posix()} {name.replace('.<locals>', '')}"
         frame = frame.f_back
     return "elsewhere"
 
