@@ -12,7 +12,16 @@ from torch.nn import functional as F
 from backends.sweep.correlate import SourceWarp
 from backends.sweep.features import CONTEXT_COARSE, FeaturePyramid, Features
 from backends.sweep.planes import FARTHEST, PLANES, Planes
-from backends.sweep.refine import CELLS, DepthHead, PlainBlock, RefineNet, activate, convex_upsample, slices
+from backends.sweep.refine import (
+    CELLS,
+    UPSAMPLING,
+    DepthHead,
+    PlainBlock,
+    RefineNet,
+    activate,
+    convex_upsample,
+    slices,
+)
 from backends.sweep.stage import Matching, Stage
 from backends.sweep.tokens import DIM, PATCH, POSITION_CHANNELS, TAPS, TokenBlock, attend, patch_places
 from backends.sweep.views import baselines
@@ -32,7 +41,7 @@ _AGREEMENT = (0.1, 0.05)  # widths of the agreement at 1/8 and 1/4
 _FARTHEST_MATCHED, _BEYOND = 0.95, 1.5  # quantile of the matched depth of a scene, and the greatest depth over it
 _BINS = 16  # channels that hold the summed probability of the planes
 _STATED = 1 + 1 + 3 + _BINS  # relative log-depth, mass, agreement, bins
-_SHOWN = 32  # channels of the U-Net that the tokens see
+_CHANGES, _SHOWN = 3, 32  # channels of the U-Net: corrections, and what the tokens see
 
 
 class PosedViews(NamedTuple):
@@ -84,6 +93,24 @@ class SweepEncoding(NamedTuple):
     centers: tuple[Tensor, ...]
 
 
+class _Swept(NamedTuple):
+    """The stage at 1/8, and what follows from it.
+
+    Attributes:
+        stage: the stage.
+        matched: its log-depth ``[V, 1, h, w]``.
+        agreeing: its :func:`agreement` with the sources ``[V, 3, h, w]``.
+        scale: median log-depth of what matches.
+        farthest: greatest log-depth of the scene.
+    """
+
+    stage: Stage
+    matched: Tensor
+    agreeing: Tensor
+    scale: Tensor
+    farthest: Tensor
+
+
 class SweepNet(nn.Module):
     """Matches at 1/8 over all depths, fills in what does not match, and matches twice more around that."""
 
@@ -91,16 +118,16 @@ class SweepNet(nn.Module):
         super().__init__()
         self.features = FeaturePyramid()
         self.matching = nn.ModuleList(Matching(channels, level == 0) for level, channels in enumerate(_CHANNELS))
-        self.refine = RefineNet(CONTEXT_COARSE + _STATED, 3 + 36 + _SHOWN)
+        self.refine = RefineNet(CONTEXT_COARSE + _STATED, _CHANGES + UPSAMPLING + _SHOWN)
         self.embed = nn.Sequential(
-            nn.Linear(4 * CONTEXT_COARSE + _STATED + 3 + _SHOWN, 2 * DIM), nn.GELU(), nn.Linear(2 * DIM, DIM)
+            nn.Linear(4 * CONTEXT_COARSE + _STATED + _CHANGES + _SHOWN, 2 * DIM), nn.GELU(), nn.Linear(2 * DIM, DIM)
         )
         self.position = nn.Linear(POSITION_CHANNELS, DIM)
         self.blocks = nn.ModuleList(TokenBlock(DIM, 4, i % 2 == 1, 2 + 2 * (i % 2)) for i in range(4))
         self.fill = nn.Linear(DIM, 2)
         self.begin = nn.Conv2d(CONTEXT_COARSE + 6, 48, 3, 1, 1)
         self.block = PlainBlock(48)
-        self.end = nn.Conv2d(48, 1 + 36, 3, 1, 1)
+        self.end = nn.Conv2d(48, 1 + UPSAMPLING, 3, 1, 1)
         self.embed_fine = nn.Sequential(nn.Linear(4 * 6 + 16 * 2, 2 * DIM), nn.GELU(), nn.Linear(2 * DIM, DIM))
         self.head = DepthHead()
         self.other = nn.Linear(3, 1)  # logit of the other answer at 1/4, from the probabilities of both and the share
@@ -122,11 +149,47 @@ class SweepNet(nn.Module):
             sources: indices of the sources of each view ``[V, n]``.
             shown: 0 where a view is matched with no source (training), else 1, ``[V, 1, H / 8, W / 8]``.
         """
-        unit = baselines(views.world_to_camera)
-        planes = Planes(unit)
-        # all depths at 1/8
+        planes = Planes(baselines(views.world_to_camera))
+        # all depths at 1/8; what does not match is filled in
+        swept, visible = self._eighth(features, views, sources, planes, shown)
+        tokens, change, mask = self._fill(swept, features, views)
+        center, guess, share = self._blend(swept, change)
+        # twice more, around that
+        quarter = convex_upsample(center, mask)
+        warp = views.warp(features.match[1], sources, 4)
+        second, visible = self._quarter(quarter, swept.stage, share, features, planes, warp, visible.detach())
+        log_depth = -planes.inverse(second.t).log()
+        agreeing = agreement((-log_depth).exp().detach(), warp, _AGREEMENT[1])
+        known = torch.cat((log_depth - swept.scale, second.mass, agreeing, log_depth - quarter), 1)
+        found = self.begin(torch.cat((features.context, known), 1))
+        found = self.end(activate(self.block(found)))
+        half = convex_upsample(log_depth + 0.1 * found[:, :1], found[:, 1:])
+        third, _ = self._narrow(2, half, _HALF, features, planes, views.warp(features.match[2], sources, 2), visible)
+        log_depth = -planes.inverse(third.t).log()
+        taps = self._taps(tokens, known, log_depth, third.mass, swept.scale, views)
+        sure = F.interpolate(torch.cat((F.avg_pool2d(second.mass, 2), share), 1), size=log_depth.shape[-2:])
+        return SweepEncoding(
+            taps[-TAPS:],
+            features.context,
+            features.context_fine,
+            torch.cat((log_depth, third.mass, sure), 1),
+            taps[-1][..., : CELLS**2],
+            (swept.stage, second, third),
+            guess,
+            (center, quarter, half),
+        )
+
+    def _eighth(
+        self, features: Features, views: PosedViews, sources: Tensor, planes: Planes, shown: Tensor | None
+    ) -> tuple[_Swept, Tensor]:
+        """The stage at 1/8 on all planes; arguments as in :meth:`encode`.
+
+        Returns:
+            What it found, and the visibility of the pixels in the sources ``[V, n, h, w]``.
+        """
         warp = views.warp(features.match[0], sources, 8)
-        position = torch.linspace(0, 1, PLANES, device=unit.device).view(1, -1, 1, 1).expand(len(unit), -1, -1, -1)
+        position = torch.linspace(0, 1, PLANES, device=sources.device).view(1, -1, 1, 1)
+        position = position.expand(len(sources), -1, -1, -1)
         first, visible = self.matching[0](features.match[0], position, planes, warp, None, shown)
         matched = -planes.inverse(first.t).log()
         agreeing = agreement((-matched).exp().detach(), warp, _AGREEMENT[0])
@@ -135,57 +198,45 @@ class SweepNet(nn.Module):
         reliable = first.mass.detach() * agreeing[:, 1:2]
         scale = _weighted_quantile(matched.detach(), reliable, 0.5)
         farthest = _weighted_quantile(matched.detach(), reliable, _FARTHEST_MATCHED) + math.log(_BEYOND)
-        # what does not match is filled in: U-Net, then attention
+        return _Swept(first, matched, agreeing, scale, farthest), visible
+
+    def _fill(self, swept: _Swept, features: Features, views: PosedViews) -> tuple[Tensor, Tensor, Tensor]:
+        """Guesses what does not match: a U-Net, then attention within and across views.
+
+        Returns:
+            Tokens ``[V, P, DIM]``, changes of the matched depth, of the guess and of the share ``[V, 3, h, w]``, and
+            the mask that upsamples to 1/4 ``[V, UPSAMPLING, h, w]``.
+        """
+        first, grid = swept.stage, (views.size[0] // PATCH, views.size[1] // PATCH)
         bins = slices(first.logits.softmax(1), _BINS)
-        stated = torch.cat((matched - scale, first.mass, agreeing, bins), 1)
+        stated = torch.cat((swept.matched - swept.scale, first.mass, swept.agreeing, bins), 1)
         found = self.refine(torch.cat((F.avg_pool2d(features.context, 2), stated), 1))
-        change, mask, seen = found[:, :3], found[:, 3:39], found[:, 39:]
-        grid = (views.size[0] // PATCH, views.size[1] // PATCH)
+        change, mask, seen = found.split((_CHANGES, UPSAMPLING, _SHOWN), 1)
         patches = torch.cat((F.pixel_unshuffle(features.context, 2), stated, change, seen), 1)
         tokens = self.embed(patches.flatten(2).mT)
-        sure = torch.stack((torch.ones_like(first.mass), first.mass, first.mass * agreeing[:, 1:2]), -1) @ self.gate
-
-        def blend(change: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            """Log-depth, matched or guessed, the guess, and the share of the matched one."""
-            guess = scale + change[:, 1:2]
-            share = torch.sigmoid(sure + change[:, 2:])
-            center = share * (matched + 0.1 * change[:, :1]) + (1 - share) * guess
-            # walls without texture were taken for sky in rooms unlike those of training
-            return center if self.training else torch.minimum(center, farthest), guess, share
-
-        place = self._places(blend(change)[0], scale, views, grid)
+        place = self._places(self._blend(swept, change)[0], swept.scale, views)
         tokens = attend(self.blocks[:2], tokens, place, grid)[-1]
         filled = F.pad(self.fill(tokens).mT.unflatten(-1, grid), (0, 0, 0, 0, 1, 0))
-        center, guess, share = blend(change + filled)
-        # twice more, around that
-        quarter = convex_upsample(center, mask)
-        warp = views.warp(features.match[1], sources, 4)
-        second, visible = self._quarter(quarter, first, share, features, planes, warp, visible.detach())
-        log_depth = -planes.inverse(second.t).log()
-        agreeing = agreement((-log_depth).exp().detach(), warp, _AGREEMENT[1])
-        known = torch.cat((log_depth - scale, second.mass, agreeing, log_depth - quarter), 1)
-        found = self.begin(torch.cat((features.context, known), 1))
-        found = self.end(activate(self.block(found)))
-        half = convex_upsample(log_depth + 0.1 * found[:, :1], found[:, 1:])
-        third, _ = self._narrow(2, half, _HALF, features, planes, views.warp(features.match[2], sources, 2), visible)
-        log_depth = -planes.inverse(third.t).log()
-        fine = F.pixel_unshuffle(torch.cat((log_depth - scale, third.mass), 1), 4)
+        return tokens, change + filled, mask
+
+    def _blend(self, swept: _Swept, change: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Returns log-depth, matched or guessed, the guess, and the share of the matched one, ``[V, 1, h, w]``."""
+        mass, agreeing = swept.stage.mass, swept.agreeing[:, 1:2]
+        sure = torch.stack((torch.ones_like(mass), mass, mass * agreeing), -1) @ self.gate
+        guess = swept.scale + change[:, 1:2]
+        share = torch.sigmoid(sure + change[:, 2:])
+        center = share * (swept.matched + 0.1 * change[:, :1]) + (1 - share) * guess
+        # walls without texture were taken for sky in rooms unlike those of training
+        return center if self.training else torch.minimum(center, swept.farthest), guess, share
+
+    def _taps(
+        self, tokens: Tensor, known: Tensor, log_depth: Tensor, mass: Tensor, scale: Tensor, views: PosedViews
+    ) -> tuple[Tensor, ...]:
+        """Adds what the later stages found to the tokens; returns those of the last blocks."""
+        fine = F.pixel_unshuffle(torch.cat((log_depth - scale, mass), 1), 4)
         tokens = tokens + self.embed_fine(torch.cat((F.pixel_unshuffle(known, 2), fine), 1).flatten(2).mT)
-        place = self._places(F.avg_pool2d(log_depth, 4), scale, views, grid)
-        taps = attend(self.blocks[2:], tokens, place, grid)
-        sure = F.interpolate(torch.cat((F.avg_pool2d(second.mass, 2), share), 1), size=log_depth.shape[-2:])
-        swept = torch.cat((log_depth, third.mass, sure), 1)
-        stages, centers = (first, second, third), (center, quarter, half)
-        return SweepEncoding(
-            taps[-TAPS:],
-            features.context,
-            features.context_fine,
-            swept,
-            taps[-1][..., : CELLS**2],
-            stages,
-            guess,
-            centers,
-        )
+        place = self._places(F.avg_pool2d(log_depth, 4), scale, views)
+        return attend(self.blocks[2:], tokens, place, (views.size[0] // PATCH, views.size[1] // PATCH))
 
     def _quarter(
         self,
@@ -262,9 +313,9 @@ class SweepNet(nn.Module):
         visible = F.interpolate(visible, size=center.shape[-2:], mode="nearest")
         return self.matching[level](features.match[level], position, planes, warp, visible)
 
-    def _places(self, log_depth: Tensor, scale: Tensor, views: PosedViews, grid: tuple[int, int]) -> Tensor:
+    def _places(self, log_depth: Tensor, scale: Tensor, views: PosedViews) -> Tensor:
         """Embedded positions of the patches, at the given log-depth, in units of the scene's matched depth."""
-        depth = log_depth.detach().flatten(1).exp()
+        depth, grid = log_depth.detach().flatten(1).exp(), (log_depth.shape[-2], log_depth.shape[-1])
         return self.position(patch_places(depth, views.world_to_camera, views.intrinsics, scale.exp(), grid))
 
 

@@ -13,6 +13,7 @@ RESPONSE = 0.02  # change of log-depth per unit of the tokens' correction channe
 _SWEPT = 4  # channels of the last stage that the head reads
 CELLS = 2  # the correction channels hold CELLS x CELLS values per patch
 _SPREAD = 48  # channels per cell after the tokens are spread over the cells
+UPSAMPLING = 9 * 4  # logits of convex_upsample: 9 neighbours of each of 4 new pixels
 _UNSURE = -2.5  # log-scale of the relative error before training
 _LOG_DEPTH = 20.0  # maximum absolute log-depth: keeps depth finite for any tokens
 
@@ -69,7 +70,7 @@ class RefineNet(nn.Module):
 def convex_upsample(x: Tensor, mask: Tensor) -> Tensor:
     """Upsamples ``[V, C, h, w]`` by two, each new pixel a convex combination of 3x3 neighbours (RAFT).
 
-    ``mask`` holds the logits of the weights ``[V, 36, h, w]``: 9 neighbours times 4 new pixels.
+    ``mask`` holds the logits of the weights ``[V, UPSAMPLING, h, w]``.
     """
     views, channels, height, width = x.shape
     weights = mask.unflatten(1, (9, 4)).softmax(1)  # [V, 9, 4, h, w]
@@ -100,7 +101,7 @@ class DepthHead(nn.Module):
         self.lift = nn.Conv2d(64, 48, 1)
         self.fine = nn.Sequential(nn.Conv2d(48 + CONTEXT_FINE + _SWEPT, 48, 3, 1, 1), PlainBlock(48))
         self.out = nn.Conv2d(48, 2, 3, 1, 1)
-        self.mask = nn.Sequential(nn.Conv2d(48, 64, 1), nn.ReLU(), nn.Conv2d(64, 9 * 4, 1))
+        self.mask = nn.Sequential(nn.Conv2d(48, 64, 1), nn.ReLU(), nn.Conv2d(64, UPSAMPLING, 1))
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)  # type: ignore[arg-type]
 
