@@ -110,10 +110,11 @@ def test_numbers_make_names_unique() -> None:
 
 def test_working_size() -> None:
     for sizes, device, wanted, expected in (
-        ([(600, 800)] * 3, "cpu", None, (210, 280)),
+        ([(600, 800)] * 3, "cpu", None, (294, 392)),
+        ([(600, 800)] * 49, "cpu", None, (210, 280)),  # many
         ([(600, 800)], "cpu", 140, (112, 140)),
         ([(600, 800)], "cpu", (28, 56), (28, 56)),
-        ([(600, 800), (800, 600)], "cpu", None, (280, 280)),
+        ([(600, 800), (800, 600)], "cpu", None, (392, 392)),
         ([(800, 600)], "cuda", None, (518, 392)),
         ([(60, 50)], "cpu", None, (56, 42)),  # not more than there is
     ):

@@ -116,11 +116,10 @@ def test_a_perfect_view_has_no_loss(start: Start) -> None:
     assert set(terms) == {"color_l1", "ssim", "depth_consistency"}
     assert all(abs(float(term)) < 1e-4 for term in terms.values())
     assert not RefineLoss().with_geometry(0).needs_geometry
-    size = start.gaussians.scales.max(-1).values
-    priced = RefineLoss(opacity=0.1, scale=2.0)
-    weights = (torch.arange(len(size)) % 2).to(size.dtype)
-    terms = priced.of_gaussians(start.gaussians, size / 2, weights)
-    assert float(priced.total(terms)) == pytest.approx(2 + 0.1 * float((weights * start.gaussians.opacities).mean()))
+    priced, opacities = RefineLoss(opacity=0.1), start.gaussians.opacities
+    weights = (torch.arange(len(opacities)) % 2).to(opacities.dtype)
+    terms = priced.of_gaussians(start.gaussians, weights)
+    assert float(priced.total(terms)) == pytest.approx(0.1 * float((weights * opacities).mean()))
     off = replace(rendered, depth=1.1 * rendered.depth)
     moved = RefineLoss().of_views(off, start.cameras, seen, 2.0)["depth_consistency"]
     hits = (rendered.depth > 0) & (rendered.alpha > 0.5)

@@ -174,6 +174,19 @@ def test_fringes_of_silhouettes_make_no_voxels(make_fine, make_room):
     assert between(clean) == 0
 
 
+def test_voxels_of_large_views_cover_as_much_as_those_of_smaller_ones(make_fine, make_room):
+    tokens, geometry, images = make_room(scenes=1)
+    longer = max(geometry.cameras.size)
+    plain = make_fine(min_footprint=6.0)(tokens, geometry, images).voxel_size
+    half = make_fine(min_footprint=6.0, footprint_view=longer // 2)(tokens, geometry, images).voxel_size
+    torch.testing.assert_close(half, plain * longer / (longer // 2))
+    for enough in (longer, 10 * longer):  # smaller views have no smaller voxels
+        same = make_fine(min_footprint=6.0, footprint_view=enough)(tokens, geometry, images).voxel_size
+        torch.testing.assert_close(same, plain)
+    with pytest.raises(ValueError, match=r"model\.fine\.footprint_view must be at least 1, or null, got 0"):
+        make_fine(footprint_view=0)
+
+
 def test_training_draws_voxel_sizes_and_inference_does_not(make_fine, make_room):
     tokens, geometry, images = make_room(scenes=2)
     module = make_fine(min_footprint=6.0, coarsest_drawn=3.0)

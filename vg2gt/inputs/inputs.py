@@ -19,7 +19,8 @@ from vg2gt.io.cameras_json import NamedCamera, Photo
 from vg2gt.monitor import Monitor
 from vg2gt.types import Cameras, Hints
 
-_LONGER_SIDE = {"cuda": 518, "cpu": 280}  # pixels, by device; foundation models are trained at about 518
+_LONGER_SIDE = {"cuda": 518, "cpu": 392}  # pixels, by device; foundation models are trained at about 518
+_MANY, _MANY_SIDE = 48, 280  # above this number of pictures, a CPU gets smaller ones
 PADDED = 1e-3
 """Mask of padding: hardly any weight, but unlike 0 it does not say that nothing is there (:func:`without_padding`)."""
 _FEWEST_POINTS = 20  # minimum observations of sparse points for a depth range
@@ -52,8 +53,8 @@ def working_size(
         sizes: ``(height, width)`` of the pictures.
         patch: patch size of the backend.
         device: type of the compute device; decides the default.
-        size: longer side in pixels (rounded down to patches), or exact (height, width); None: 518 on a GPU, 280 on a
-            CPU, but at most the median longer side of the pictures.
+        size: longer side in pixels (rounded down to patches), or exact (height, width); None: 518 on a GPU, 392 on a
+            CPU (280 of more than 48 pictures), but at most the median longer side of the pictures.
 
     Raises:
         ValueError: if the size is smaller than a patch, or given exactly and not a multiple of the patch.
@@ -67,7 +68,10 @@ def working_size(
         raise ValueError(f"size {size} is smaller than one patch of {patch} pixels")
     shape = math.exp(sum(math.log(height / width) for height, width in sizes) / len(sizes))
     longest = sorted(max(pair) for pair in sizes)[len(sizes) // 2]
-    longer = max(size or min(_LONGER_SIDE.get(device, _LONGER_SIDE["cuda"]), longest), patch) // patch
+    usual = _LONGER_SIDE.get(device, _LONGER_SIDE["cuda"])
+    if device == "cpu" and len(sizes) > _MANY:
+        usual = _MANY_SIDE
+    longer = max(size or min(usual, longest), patch) // patch
     shorter = max(1, round(longer * min(shape, 1 / shape)))
     return (longer * patch, shorter * patch) if shape > 1 else (shorter * patch, longer * patch)
 

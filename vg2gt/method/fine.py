@@ -56,6 +56,8 @@ class FineModule(nn.Module):
         point_mlp: factory of the voxel network, called with ``in_channels``.
         voxel_size: edge length in scene units.
         min_footprint: smallest edge in pixels at the scene's median depth; 0 disables this bound.
+        footprint_view: longer side in pixels above which views count as reduced to it in ``min_footprint``: larger
+            views then improve the depth, but add no voxels. None: views count as they are.
         coarsest_drawn: training multiplies the smallest edge by a factor drawn log-uniformly from 1 to this value, so
             that one head supports several voxel sizes.
         max_voxels: largest number of voxels per scene; above it the least confident are dropped, with a warning in the
@@ -72,7 +74,8 @@ class FineModule(nn.Module):
         cap: counts the voxels that ``max_voxels`` drops.
 
     Raises:
-        ValueError: if ``max_voxels`` or ``coarsest_drawn`` is below 1, or ``normal_kernel`` is neither 1 nor 3.
+        ValueError: if ``max_voxels``, ``footprint_view`` or ``coarsest_drawn`` is below 1, or ``normal_kernel`` is
+            neither 1 nor 3.
     """
 
     def __init__(
@@ -83,6 +86,7 @@ class FineModule(nn.Module):
         point_mlp: Callable[..., PointMLP],
         voxel_size: float = 0.002,
         min_footprint: float = 1.0,
+        footprint_view: int | None = None,
         coarsest_drawn: float = 1.0,
         max_voxels: int | None = None,
         moments: bool = False,
@@ -94,8 +98,11 @@ class FineModule(nn.Module):
             raise ValueError(f"model.fine.normal_kernel must be 1 or 3, got {normal_kernel}")
         if not coarsest_drawn >= 1:
             raise ValueError(f"model.fine.coarsest_drawn must be at least 1, got {coarsest_drawn}")
+        if footprint_view is not None and footprint_view < 1:
+            raise ValueError(f"model.fine.footprint_view must be at least 1, or null, got {footprint_view}")
         self.voxel_size = voxel_size
         self.min_footprint = min_footprint
+        self.footprint_view = footprint_view
         self.coarsest_drawn = coarsest_drawn
         self.cap = Cap("model.fine.max_voxels", max_voxels, "voxels", "least confident")
         self.dense_head = dense_head(token_dims=token_dims, patch_size=patch_size)
@@ -117,8 +124,9 @@ class FineModule(nn.Module):
         if self.training and self.coarsest_drawn > 1:
             drawn = self.coarsest_drawn ** torch.rand(len(geometry.depth), device=geometry.depth.device)
             coarsen = drawn if coarsen is None else coarsen * drawn
+        larger = 1.0 if self.footprint_view is None else max(1.0, max(geometry.cameras.size) / self.footprint_view)
         with full_precision(geometry.depth):
-            return scene_voxel_size(geometry, self.voxel_size, self.min_footprint, coarsen)
+            return scene_voxel_size(geometry, self.voxel_size, larger * self.min_footprint, coarsen)
 
     def pool(
         self, tokens: Tokens, geometry: Geometry, images: Tensor, size: Tensor, capped: bool = True

@@ -75,7 +75,8 @@ class Pipeline(LoadedModel):
         Args:
             images: paths, a folder, a video, a recording, or images in memory
                 (:func:`vg2gt.inputs.pictures.find_pictures`).
-            size: longer side of the images in the model in pixels, or height and width; None: 518, on a CPU 280.
+            size: longer side of the images in the model in pixels, or height and width; None: 518, on a CPU
+                392 (280 of more than 48 images).
             quality: how long photographs are refined (:func:`vg2gt.reconstruction.policy.refinement_for`).
             refine: whether the scene is then refined on its images; a number of steps refines at the working size
                 only. None: up to 100 photographs are refined, RGB-D recordings are not.

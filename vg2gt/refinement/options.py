@@ -84,7 +84,6 @@ class RefineLoss:
         normal_decoded: weight of ``1 - cos`` between rendered normals and the normals of the decoded depth.
         opacity: weight of the mean opacity of what trained views show, which makes Gaussians that no image needs
             transparent.
-        scale: weight of the mean growth of each Gaussian's largest side, relative to its initial length.
 
     Raises:
         ValueError: if a weight is negative.
@@ -96,7 +95,6 @@ class RefineLoss:
     normal_render: float = 0.1
     normal_decoded: float = 0.1
     opacity: float = 0.0
-    scale: float = 0.0
 
     def __post_init__(self) -> None:
         _not_negative(self, "loss")
@@ -140,20 +138,14 @@ class RefineLoss:
             terms["normal_decoded"] = normal_error(normal, expected, seen.depth_conf, hits & valid)
         return terms
 
-    def of_gaussians(self, gaussians: Gaussians, size: Tensor, seen: Tensor) -> dict[str, Tensor]:
+    def of_gaussians(self, gaussians: Gaussians, seen: Tensor) -> dict[str, Tensor]:
         """Returns the unweighted terms of the Gaussians whose weight is not 0.
 
         Args:
             gaussians: the G Gaussians.
-            size: ``[G]`` initial largest standard deviations.
             seen: ``[G]`` weights of their opacities in [0, 1].
         """
-        terms: dict[str, Tensor] = {}
-        if self.opacity:
-            terms["opacity"] = (seen * gaussians.opacities).mean()
-        if self.scale:
-            terms["scale"] = (gaussians.scales.max(-1).values / size - 1).clamp(min=0).mean()
-        return terms
+        return {"opacity": (seen * gaussians.opacities).mean()} if self.opacity else {}
 
     def total(self, terms: dict[str, Tensor]) -> Tensor:
         """Returns the weighted sum of the terms."""

@@ -90,7 +90,6 @@ class Parameters:
     Attributes:
         values: the parameters by name; those of Gaussians have one row each.
         unit: ``[G]`` unit in which positions move.
-        size: ``[G]`` largest standard deviations at the start.
         seen: ``[G]`` 1 for Gaussians that trained views show, else 0: nothing but the penalty on opacity would reach
             the others, and remove them. 1 for all at first.
         least: ``[G]`` logarithm of the smallest standard deviation that a step may reach; -inf for all at first.
@@ -102,9 +101,8 @@ class Parameters:
         self.start = start
         self.pixel, self.depth, self.trained = pixel, depth, trained.to(gaussians.means.device)
         self.unit = gaussians.scales.median(-1).values
-        self.size = gaussians.scales.max(-1).values
-        self.seen = torch.ones_like(self.size)
-        self.least = torch.full_like(self.size, -math.inf)
+        self.seen = torch.ones_like(gaussians.opacities)
+        self.least = torch.full_like(self.seen, -math.inf)
         self.values = {
             "means": gaussians.means.clone(),
             "quats": F.normalize(gaussians.quats, dim=-1),
@@ -251,12 +249,11 @@ class Parameters:
 
     def _replace(self, change: Callable[[Tensor], Tensor]) -> None:
         """Applies a change of rows to all that is known of the Gaussians."""
-        known = (self.unit, self.size, self.seen, self.least, self.counts)
-        unit, size, seen, least, counts = map(change, known)
+        unit, seen, least, counts = map(change, (self.unit, self.seen, self.least, self.counts))
         values = self.values | {name: change(self.values[name]) for name in _OF_GAUSSIANS}
         moments = self.moments | {name: _both(change, self.moments[name]) for name in _OF_GAUSSIANS}
         # at once, because Ctrl-C during the copies must leave a scene that fits together
-        self.unit, self.size, self.seen, self.least, self.counts = unit, size, seen, least, counts
+        self.unit, self.seen, self.least, self.counts = unit, seen, least, counts
         self.values, self.moments = values, moments
 
 

@@ -254,7 +254,7 @@ class _Refinement:
         of_step = self.options.loss.with_geometry(0 if self.steps % every else every)
         view = self.order.deal().to(self.seen.images.device)
         loss, images = _view_loss(scene, self.seen, self.renderer, of_step, view, self.depth)
-        if terms := of_step.of_gaussians(scene.gaussians, self.parameters.size, self.parameters.seen):
+        if terms := of_step.of_gaussians(scene.gaussians, self.parameters.seen):
             loss = loss + of_step.total(terms)
         self.recent.append(float(images.mean()))
         self.steps += 1

@@ -188,7 +188,7 @@ class _Sharpening:
         rows = self._rows(crop)
         scene = self.parameters.scene(rows)
         rendered, image = self._terms(scene, crop, of_step)
-        if terms := of_step.of_gaussians(scene.gaussians, self.parameters.size[rows], self.parameters.seen[rows]):
+        if terms := of_step.of_gaussians(scene.gaussians, self.parameters.seen[rows]):
             rendered = rendered + of_step.total(terms)
         self.recent = [*self.recent, *([image] if math.isfinite(image) else [])][-20:]
         self.steps += 1
