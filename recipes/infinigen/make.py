@@ -28,7 +28,6 @@ INFINIGEN, BLENDER = "infinigen==1.15.5", "bpy==4.2.0"
 # Infinigen's name of a kind of room, and prefix of the names of its floors.
 KINDS = {"DiningRoom": "dining-room", "LivingRoom": "living-room"}
 KINDS |= {"Bedroom": "bedroom", "Kitchen": "kitchen", "Bathroom": "bathroom"}
-PREFIXES = KINDS | {"Hallway": "hallway", "Garage": "garage", "Utility": "utility"}
 TEST = {int(seed): name for seed, name in json.loads((HERE / "test_rooms.json").read_text()).items()}
 """Rooms that report a result and never choose one, by seed."""
 HELD_OUT = (3, 7, 10, 14, 16, 24, 28, 30, 32, 36)

@@ -25,7 +25,7 @@ import bpy  # noqa: E402
 
 os.sched_setaffinity(0, _cores)
 import numpy as np  # noqa: E402
-from make import PREFIXES  # noqa: E402
+from make import KINDS  # noqa: E402
 from mathutils import Matrix, Vector  # noqa: E402
 from paths import View, plan  # noqa: E402
 from PIL import Image  # noqa: E402
@@ -53,7 +53,7 @@ class Room:
         self._scene = bpy.context.scene
         self._graph = bpy.context.evaluated_depsgraph_get()
         meshes = [item for item in bpy.data.objects if item.type == "MESH" and item.visible_get()]
-        floors = [item for item in meshes if item.name.startswith(PREFIXES[kind]) and ".floor" in item.name]
+        floors = [item for item in meshes if item.name.startswith(KINDS[kind]) and ".floor" in item.name]
         if not floors:
             raise SystemExit(f"the scene has no floor of a {kind}")
         things = [_thing(item) for item in meshes if "Factory" in item.name and not any(x in item.name for x in _FIXED)]
@@ -241,7 +241,7 @@ def main() -> None:
     parser.add_argument("blend", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--seed", type=int, required=True)
-    parser.add_argument("--kind", choices=list(PREFIXES), required=True)
+    parser.add_argument("--kind", choices=list(KINDS), required=True)
     parser.add_argument("--views", type=int, default=60)
     parser.add_argument("--size", type=int, nargs=2, default=(112, 224), metavar=("HEIGHT", "WIDTH"))
     args = parser.parse_args()
