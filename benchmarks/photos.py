@@ -33,6 +33,7 @@ from vg2gt.io import read_gaussian_ply
 from vg2gt.io.files import read_json, write_text
 from vg2gt.io.images import grid, write_png
 from vg2gt.metrics import LPIPS, WeightsNotFoundError, load_lpips, psnr, ssim
+from vg2gt.reconstruction.photographs import of_full_size
 from vg2gt.reconstruction.pipeline import reconstruct_with
 from vg2gt.reconstruction.refined import refine_scene
 from vg2gt.reconstruction.scene import Scene
@@ -140,7 +141,7 @@ def ours(
             continue
         restart_peak_memory()
         began = time.process_time()
-        steps = None if refinement.full is None else refinement.steps  # of the stage at the working size
+        steps = None if of_full_size(scene, refinement) is None else refinement.steps  # of the first of two stages
         options = replace(refinement, steps=steps, seconds=budget - taken)
         refined = refine_scene(scene, options, clock=time.process_time)
         seconds = taken + time.process_time() - began

@@ -82,7 +82,8 @@ def test_the_summary_says_which_state_is_kept(scene: Scene) -> None:
 
 def test_photographs_are_refined_unless_asked_not_to(scene: Scene) -> None:
     """Cameras from bundle adjustment stay, predicted ones move; recordings are refined on demand."""
-    photographs = replace(scene, cameras_from="structure from motion, 4 of 4 images")
+    pictures = tuple(replace(picture, size=(900, 1200)) for picture in scene.pictures)
+    photographs = replace(scene, pictures=pictures, cameras_from="structure from motion, 4 of 4 images")
     assert refined_by_default(photographs)
     normal = refinement_for(photographs)
     assert (normal.steps, normal.rates.cameras, normal.min_views) == (240, 0.0, 3)
@@ -90,7 +91,12 @@ def test_photographs_are_refined_unless_asked_not_to(scene: Scene) -> None:
     normal_full, high_full = normal.full, refinement_for(photographs, "high").full
     assert high_full.steps > 3 * normal_full.steps
     assert refinement_for(photographs, overrides=["refine.full.crop=64"]).full.crop == 64
-    assert refinement_for(replace(photographs, pictures=())).full is None  # no photographs to go on with
+    alone = refinement_for(replace(photographs, pictures=()))  # no photographs to go on with
+    assert (alone.full, alone.steps) == (None, 720)
+    assert refinement_for(replace(photographs, pictures=()), overrides=["refine.steps=9"]).steps == 9
+    small = replace(photographs, pictures=scene.pictures)
+    assert refinement_for(small) == alone
+    assert (refinement_for(small).full, refinement_for(small, seconds=9).steps) == (None, None)
     predicted = refinement_for(replace(scene, cameras_from=""), steps=7)
     assert (predicted.steps, predicted.rates.cameras) == (7, RefineRates().cameras)
     recording = replace(scene, cameras_from="RGB-D recording somewhere")

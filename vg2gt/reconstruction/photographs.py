@@ -18,6 +18,9 @@ from vg2gt.types import Cameras
 
 if TYPE_CHECKING:
     from vg2gt.reconstruction.scene import Scene
+    from vg2gt.refinement import FullSizeOptions, RefineOptions
+
+_LARGER = 1.25  # factor from the working size to that of the photographs from which these are refined on their own
 
 
 def full_size(pictures: Sequence[Picture], working: tuple[int, int], longest: int) -> tuple[int, int]:
@@ -31,6 +34,14 @@ def full_size(pictures: Sequence[Picture], working: tuple[int, int], longest: in
     sides = sorted(max(picture.size) for picture in pictures)
     factor = max(1.0, min(longest, sides[len(sides) // 2]) / max(working))
     return (round(working[0] * factor), round(working[1] * factor))
+
+
+def of_full_size(scene: Scene, options: RefineOptions) -> FullSizeOptions | None:
+    """Returns the options of the second stage; None without one, or if the photographs show no more than the views."""
+    if options.full is None or not scene.pictures:
+        return None
+    size = full_size(scene.pictures, scene.cameras.size, options.full.size)
+    return options.full if max(size) >= _LARGER * max(scene.cameras.size) else None
 
 
 def load_photographs(pictures: Sequence[Picture], cameras: Cameras, longest: int, monitor: Monitor) -> Photographs:

@@ -10,12 +10,17 @@ from hydra.utils import instantiate
 
 from vg2gt.config import compose_groups
 from vg2gt.inputs.camera_source import CameraSource
+from vg2gt.reconstruction.photographs import of_full_size
 from vg2gt.reconstruction.windows.store import AUTOMATIC
 from vg2gt.refinement import RefineOptions, RefineRates
 from vg2gt.types import check_choice
 
 if TYPE_CHECKING:
     from vg2gt.reconstruction.scene import Scene
+
+# Factor on the steps at the working size if there is no stage at full size. 280 pixels, held-out photographs, 3 instead
+# of 1: fox, bananas and tree gain 0.6 to 0.9 dB, a beach loses 0.2 dB.
+_ALONE = 3
 
 Quality = Literal["draft", "normal", "high"]
 Refinement = bool | int | RefineOptions | None
@@ -37,7 +42,8 @@ def refinement_for(
         scene: the scene. Recordings are refined by ``configs/refine/default.yaml``, all others by
             ``photographs.yaml``, ``draft.yaml`` or ``high.yaml``, according to ``quality``.
         quality: ``draft`` stays at the working size; ``high`` takes eight times as many steps at full size
-            as ``normal``.
+            as ``normal``. Photographs that are hardly larger than the working size are refined at that size only, in
+            three times as many steps.
         overrides: Hydra overrides: ``refine=NAME`` and ``refine.key=value``.
         **changes: options that are set after the overrides unless they are None, such as ``seconds``, which alone
             replaces the default number of steps.
@@ -52,8 +58,11 @@ def refinement_for(
     moved = [f"refine.rates.cameras={RefineRates().cameras}"] if predicted else []  # unless an override says otherwise
     found = read_options(name, [*moved, *overrides])
     given: dict[str, Any] = {key: value for key, value in changes.items() if value is not None}
-    if not scene.pictures:  # only the working size can be refined
-        found = replace(found, full=None)
+    if found.full is not None and of_full_size(scene, found) is None:
+        # the working size is all there is, and gets all steps
+        asked = any(override.startswith("refine.steps=") for override in overrides)
+        steps = found.steps if asked or found.steps is None else _ALONE * found.steps
+        found = replace(found, steps=steps, full=None)
     if "seconds" in given and found.full is None:
         given = {"steps": None, **given}
     return replace(found, **given)

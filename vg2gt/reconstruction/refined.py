@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 from vg2gt.memory import RECONSTRUCTION, memory_advice, note_sizes
 from vg2gt.monitor import Monitor
-from vg2gt.reconstruction.photographs import full_size, load_photographs, sparse_points
+from vg2gt.reconstruction.photographs import load_photographs, of_full_size, sparse_points
 from vg2gt.reconstruction.policy import Quality, Refinement, chosen_refinement
 from vg2gt.reconstruction.surroundings import without_debris
 from vg2gt.refinement import (
-    FullSizeOptions,
     Observations,
     RefineOptions,
     exposure_rates,
@@ -36,7 +35,6 @@ log = logging.getLogger(__name__)
 
 _USABLE = 17.0  # dB; scenes below it look like fog
 _WORKING_SHARE = 0.45  # of the time, at most, for the stage at the working size
-_LARGER = 1.25  # factor from the working size to that of the photographs from which these are refined on their own
 
 
 def refine_scene(
@@ -61,7 +59,7 @@ def refine_scene(
     seen = Observations(scene.images, scene.depth, scene.depth_conf, scene.mask).to(device)
     rates = exposure_rates(options.rates, scene.gaussians, scene.cameras, seen, scene.renderer)
     options = replace(options, rates=rates)
-    full = _of_full_size(scene, options)
+    full = of_full_size(scene, options)
     at_working_size = options
     if full is not None and options.seconds is not None:
         at_working_size = replace(options, seconds=_WORKING_SHARE * options.seconds)
@@ -90,14 +88,6 @@ def refine_scene(
         renderer=scene.renderer if refined.sharpened is None else refined.sharpened.renderer,
     )
     return without_debris(made)
-
-
-def _of_full_size(scene: Scene, options: RefineOptions) -> FullSizeOptions | None:
-    """Returns the options of the second stage; None without one, or if the photographs show no more than the views."""
-    if options.full is None or not scene.pictures:
-        return None
-    size = full_size(scene.pictures, scene.cameras.size, options.full.size)
-    return options.full if max(size) >= _LARGER * max(scene.cameras.size) else None
 
 
 def refined_by_policy(
