@@ -57,7 +57,7 @@ def _parser() -> argparse.ArgumentParser:
         "recording with known cameras")  # fmt: skip
     add = parser.add_argument_group("input").add_argument
     add("--size", type=_size, metavar="N|HxW", help="longer side, or height and width, in pixels at which the model "
-        "works; default: 518, on a CPU 392 (280 of more than 48 images)")  # fmt: skip
+        "works; default: 518, on a CPU 392 (many: 280)")  # fmt: skip
     add("--max-images", type=int, metavar="N", help="use at most N, evenly spaced; default: all, 32 of a video")
     add("--poses", choices=("auto", "given", "sfm"), default="auto", metavar="SOURCE", help="cameras: given (files "
         "next to the images), sfm (structure from motion) or auto (default: given if there are any)")  # fmt: skip
