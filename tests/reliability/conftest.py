@@ -13,6 +13,8 @@ def whole(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> Path:
     """The uninterrupted run."""
 
     def run(folder: Path) -> None:
-        harness.finish(harness.TRAIN, harness.training(folder / "run", cache), folder / "run")
+        # on some processors (Intel with AVX-512) the run that compiles the kernels differs in the last bits from others
+        for name in ("compiling", "run"):
+            harness.finish(harness.TRAIN, harness.training(folder / name, cache), folder / name)
 
     return made_once(tmp_path_factory, "whole", run) / "run"
